@@ -32,6 +32,7 @@ Context = Annotated[int, Field(ge=2, le=8192, multiple_of=2)]
 Latent = Annotated[int, Field(ge=1, le=256)]
 TimeBins = Annotated[int, Field(ge=1, le=65536)]
 PoolRank = Annotated[int, Field(ge=1, le=8)]
+Octaves = Annotated[int, Field(ge=0, le=8)]
 Stack = Annotated[int, Field(ge=1, le=32)]
 Rows = Annotated[list[Annotated[int, Field(ge=0, le=4096)]], Field(max_length=65)]
 Size = Annotated[int, Field(ge=1, le=65536)]
@@ -64,10 +65,11 @@ class EvaeSettings:
     time_bins: TimeBins
     coding: Coding
     pool_rank: PoolRank = 1
+    octaves: Octaves = 0
 
     @pydantic.model_validator(mode="after")
     def _fits_its_variant(self) -> "EvaeSettings":
-        _check_coding(self.variant, self.coding, self.pool_rank)
+        _check_coding(self.variant, self.coding, self.pool_rank, self.octaves)
         return self
 
 
@@ -91,7 +93,7 @@ class EncoderModel(Model):
 
     Attributes:
         name: The kind, also the variant of the event VAE.
-        context, latent, norm, target, time_bins, coding, pool_rank: As `EvaeSettings`.
+        context, latent, norm, target, time_bins, coding, pool_rank, octaves: As `EvaeSettings`.
         encoder: What PPO does with the pretrained encoder.
         stack: Latest latents that the policy sees.
         hidden: Neurons of each dense layer.
@@ -115,12 +117,13 @@ class EncoderModel(Model):
     hidden: list[Size]
     memory_ms: TimesMs = dataclasses.field(default_factory=list)
     pool_rank: PoolRank = 1
+    octaves: Octaves = 0
     own_actions: bool = False
     own_velocity: bool = False
 
     @pydantic.model_validator(mode="after")
     def _fits_its_kind(self) -> "EncoderModel":
-        _check_coding(self.name, self.coding, self.pool_rank)
+        _check_coding(self.name, self.coding, self.pool_rank, self.octaves)
         if self.encoder == "finetuned":
             if not KINDS[self.name].finetuning:
                 able = ", ".join(name for name, kind in KINDS.items() if kind.finetuning)
@@ -141,7 +144,8 @@ class EncoderModel(Model):
     def evae(self, width: int, height: int) -> EvaeSettings:
         """Return settings of its event VAE on a sensor of so many pixels."""
         own = (self.context, self.latent, self.norm, self.target, self.time_bins, self.coding)
-        return EvaeSettings(cast(Variant, self.name), width, height, *own, pool_rank=self.pool_rank)
+        added = (self.pool_rank, self.octaves)
+        return EvaeSettings(cast(Variant, self.name), width, height, *own, *added)
 
 
 @dataclass(frozen=True, config=STRICT)
@@ -277,6 +281,7 @@ KINDS = {
 ADDED_MODEL_SETTINGS: dict[str, object] = {
     "memory_ms": [],
     "pool_rank": 1,
+    "octaves": 0,
     "own_actions": False,
     "own_velocity": False,
     "bands": [],
@@ -458,13 +463,15 @@ def checked(section: Callable[..., T], values: Mapping[str, object]) -> T:
         raise ValueError("; ".join(map(_one_line, error.errors()))) from None
 
 
-def _check_coding(name: str, coding: str, pool_rank: int) -> None:
-    """Raise ValueError for a code of time or a rank that this encoder cannot have."""
+def _check_coding(name: str, coding: str, pool_rank: int, octaves: int) -> None:
+    """Raise ValueError for a code of time, a rank or octaves that this encoder cannot have."""
     if coding == "eventnet" and name != "bytestream":
         raise ValueError(f"coding must be additive or none for {name}, which has no time, got 'eventnet'")
     if pool_rank > 1 and (coding == "eventnet" or name == "event_image_vae"):
         pooled = "coding=eventnet, whose phase is the largest value's" if coding == "eventnet" else name
         raise ValueError(f"pool_rank must be 1 for {pooled}, got {pool_rank}")
+    if octaves and name == "event_image_vae":
+        raise ValueError(f"octaves must be 0 for {name}, whose convolutions know places, got {octaves}")
 
 
 def _one_line(problem: Mapping[str, Any]) -> str:

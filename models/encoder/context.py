@@ -5,6 +5,10 @@
 ECN is three per-event layers (64, 128, context), each with batch normalisation and ReLU.
 ReLU floors the context at 0, which is therefore the identity of the maximum.
 
+With `octaves` the first layer also reads sin and cos of pi/2 2^k x and y, k = 0, 1, ..., for x and y in
+[-1, 1]: a network of coordinates alone learns only smooth functions of them (Tancik et al. 2020). The table
+of the frozen encoder has as many rows, and costs the same.
+
 With `pool_rank` r > 1 a context holds the r-th largest value of each feature instead, 0 of fewer than r
 events: r - 1 false events alone cannot raise it. An event that occurs twice then counts twice.
 
@@ -25,6 +29,7 @@ the last layer and the maximum are torch's (`max_on_device`).
 """
 
 import itertools
+import math
 from typing import Any, NamedTuple
 
 import numba
@@ -52,6 +57,7 @@ class EventContextNetwork(nn.Module):
             subtracts it again, and its gradient would be rounding noise that Adam amplifies.
         coding: Of time, one of `models.encoder.embedding.CODINGS`; "bytestream_xy" has none.
         pool_rank: Which value over the events is the context: 1, the largest, or the second, third, ...
+        octaves: Of sines and cosines of x and y that the first layer reads as well.
 
     A frozen network (parameters that need no gradient) never moves its running statistics,
     not even in train mode.
@@ -65,13 +71,14 @@ class EventContextNetwork(nn.Module):
         norm: str,
         coding: str = "additive",
         pool_rank: int = 1,
+        octaves: int = 0,
     ) -> None:
         super().__init__()
         self.grid = grid
         self.uses_polarity = variant == "bytestream"
         self.coding = coding if variant == "bytestream" else "none"
-        self.pool_rank = pool_rank
-        sizes = [3 if self.uses_polarity else 2, 64, 128, context]
+        self.pool_rank, self.octaves = pool_rank, octaves
+        sizes = [4 * octaves + (3 if self.uses_polarity else 2), 64, 128, context]
         bias = norm == "none"
         self.layers = nn.ModuleList(Linear(a, b, bias=bias) for a, b in itertools.pairwise(sizes))
         self.norms = nn.ModuleList(nn.BatchNorm1d(size) for size in sizes[1:] if norm == "batch")
@@ -158,13 +165,15 @@ class EventContextNetwork(nn.Module):
         return torch.cat([magnitude * part[winning_bin.long()] for part in phase], dim=1)
 
     def _inputs(self, cell: np.ndarray) -> Tensor:
-        """Return inputs (N, 3 or 2) of cells: x, y scaled to [-1, 1], then p."""
+        """Return inputs of cells (N, inputs): x, y scaled to [-1, 1], p if it is read, and the octaves."""
         width, height = self.grid.width, self.grid.height
         columns = [
             2.0 * (cell % width) / max(width - 1, 1) - (width > 1),
             2.0 * (cell // width % height) / max(height - 1, 1) - (height > 1),
             2.0 * (cell // (width * height)) - 1.0,
         ][: 3 if self.uses_polarity else 2]
+        turns = [0.5 * math.pi * 2.0**k * place for k in range(self.octaves) for place in columns[:2]]
+        columns += [wave(turn) for turn in turns for wave in (np.sin, np.cos)]
         return torch.from_numpy(np.stack(columns, axis=1)).to(self.layers[0].weight)
 
     def _share(self, multiplicity: np.ndarray, events: int) -> Tensor | None:

@@ -61,6 +61,8 @@ class EventVAE(nn.Module):
             and takes "additive" as "none".
         pool_rank: Which value of a feature over the events the context holds: 1, the largest (appendix A.1),
             or the second, third, ... largest, so that single false events cannot raise it.
+        octaves: Of sines and cosines of x and y that the per-event network reads beside x and y; 0: none
+            (appendix A.1).
 
     Raises:
         ValueError: A setting outside its range; the message names it.
@@ -78,12 +80,13 @@ class EventVAE(nn.Module):
         time_bins: int = 1024,
         coding: str = "additive",
         pool_rank: int = 1,
+        octaves: int = 0,
     ) -> None:
         super().__init__()
         values = {
             "variant": variant, "width": width, "height": height, "context": context,
             "latent": latent, "norm": norm, "target": target, "time_bins": time_bins, "coding": coding,
-            "pool_rank": pool_rank,
+            "pool_rank": pool_rank, "octaves": octaves,
         }  # fmt: skip
         self.settings = checked(EvaeSettings, values)
         self.grid = Grid(width, height, time_bins)
@@ -91,7 +94,7 @@ class EventVAE(nn.Module):
         self.ecn: nn.Module = (
             PictureContextNetwork(self.grid, context)
             if variant == "event_image_vae"
-            else EventContextNetwork(self.grid, variant, context, norm, coding, pool_rank)
+            else EventContextNetwork(self.grid, variant, context, norm, coding, pool_rank, octaves)
         )
         parts = 2 if coding == "eventnet" else 1  # real and imaginary
         self.encoder = nn.Sequential(Linear(parts * context, 256), nn.ReLU(), Linear(256, 2 * latent))

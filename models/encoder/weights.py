@@ -31,7 +31,7 @@ DECODER = "decoder."  # of the names of its tensors
 LEAN = {torch.float32: torch.float16}  # what a tensor may be rounded to
 RESERVED = ("format", "model", "sha256")
 CHECKSUM = "checksum"  # of a manifest's other values; manifests of older versions have none
-ADDED_SETTINGS = {"coding": "additive", "pool_rank": 1}  # of files without these keys
+ADDED_SETTINGS = {"coding": "additive", "pool_rank": 1, "octaves": 0}  # of files without these keys
 
 
 class EncoderManifest(TypedDict, total=False):

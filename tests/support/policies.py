@@ -78,7 +78,7 @@ def make_spec(name, **changes):
         "norm": "batch",
     }
     own |= {"target": "signed", "time_bins": 32, "coding": "additive", "pool_rank": 1, "encoder": "frozen"}
-    own |= {"own_actions": False, "own_velocity": False, "bands": []}
+    own |= {"octaves": 0, "own_actions": False, "own_velocity": False, "bands": []}
     own |= changes
     return PolicySpec(read_model(**{key: own[key] for key in model_keys(name)}), SIDE, SIDE, 3)
 

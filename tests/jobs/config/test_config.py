@@ -23,6 +23,7 @@ JOBS = {
     "calibrated_camera": "study",
     "camera_rates": "study",
     "encoder_seeds": "study",
+    "encoder_targets": "study",
     "false_events": "study",
     "pooling": "study",
     "learning_rates": "study",

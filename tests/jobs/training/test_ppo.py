@@ -187,7 +187,7 @@ def test_the_networks_are_built_from_what_the_configuration_says():
         policy_spec(make_config(f"model={name}")).manifest() for name in ("bytestream_xy", "event_image")
     )
     evae = {"context": 256, "latent": 32, "norm": "batch", "target": "occupancy", "time_bins": 1024}
-    evae |= {"coding": "none", "pool_rank": 1, "own_actions": False, "own_velocity": False}
+    evae |= {"coding": "none", "pool_rank": 1, "octaves": 0, "own_actions": False, "own_velocity": False}
     evae |= {"encoder": "frozen"}
     assert bytestream == {"name": "bytestream_xy", "hidden": [64, 64], "memory_ms": [], **evae, **sizes}
     assert image == {"name": "event_image", **sizes}

@@ -30,10 +30,10 @@ def make_batch(seed, sizes=SIZES, grid=GRID):
 
 
 def make_network(
-    variant="bytestream", norm="batch", dtype=torch.float64, context=48, coding="additive", rank=1
+    variant="bytestream", norm="batch", dtype=torch.float64, context=48, coding="additive", rank=1, octaves=0
 ):
     torch.manual_seed(1)
-    network = EventContextNetwork(GRID, variant, context, norm, coding, rank).to(dtype)
+    network = EventContextNetwork(GRID, variant, context, norm, coding, rank, octaves).to(dtype)
     for normalisation in network.norms:
         torch.nn.init.uniform_(normalisation.weight, 0.5, 1.5)
         torch.nn.init.uniform_(normalisation.bias, -0.3, 0.3)
@@ -72,7 +72,7 @@ def relative_differences(network, batches):
 @pytest.mark.parametrize(("variant", "coding", "rank", "norm"), CASES)
 @pytest.mark.parametrize("training", [True, False])
 def test_the_fused_form_is_the_plain_formula_in_float64(variant, coding, rank, norm, training):
-    network = make_network(variant, norm, coding=coding, rank=rank).train(training)
+    network = make_network(variant, norm, coding=coding, rank=rank, octaves=rank - 1).train(training)
     differences = relative_differences(network, [make_batch(0), make_batch(1, [500, 3])])
     assert max(differences.values()) < 1e-10, differences
 
@@ -289,6 +289,36 @@ def test_the_feature_of_a_cell_is_what_a_window_of_it_shows():
 def test_a_batch_of_another_grid_is_refused():
     with pytest.raises(ValueError, match="make it with the model's grid"):
         make_network()(make_batch(0, [2], Grid(4, 4, 32)))
+
+
+def test_octaves_are_the_sines_and_cosines_of_a_place_with_half_the_period_each():
+    network = make_network(octaves=3)
+    cells = np.array([0, GRID.width - 1, GRID.width * (GRID.height - 1)])
+    inputs = network._inputs(cells).numpy()
+    assert inputs[:, :2].tolist() == [[-1, -1], [1, -1], [-1, 1]]
+    for k in range(3):
+        sin_x, cos_x, sin_y, cos_y = inputs[:, 3 + 4 * k : 7 + 4 * k].T
+        for sine, cosine, place in ((sin_x, cos_x, inputs[:, 0]), (sin_y, cos_y, inputs[:, 1])):
+            assert np.allclose(sine, np.sin(0.5 * np.pi * 2**k * place))
+            assert np.allclose(sine**2 + cosine**2, 1)
+
+
+def test_octaves_tell_places_apart_that_coordinates_alone_confuse():
+    """A network of one size learns which columns of pixels are even, by octaves better than by x and y."""
+
+    def error(octaves):
+        torch.manual_seed(0)
+        network = EventContextNetwork(Grid(16, 2, 4), "bytestream_xy", 8, "none", "none", 1, octaves)
+        even = torch.from_numpy((np.arange(32) % 16 % 2).astype(np.float32))
+        optimizer = torch.optim.Adam(network.parameters(), lr=3e-3)
+        for _ in range(150):
+            loss = (network.cell_features()[:, 0] - even).square().mean()
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+        return float(loss)
+
+    assert error(4) < 0.1 * error(0)
 
 
 def test_a_single_pixel_sensor_is_at_the_origin():

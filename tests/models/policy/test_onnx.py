@@ -73,7 +73,7 @@ def folder(request, tmp_path_factory):
     changes = {
         "bytestream_xy": {"variant": "bytestream_xy"},
         "eventnet": {"coding": "eventnet"},
-        "ranked": {"pool_rank": 3},
+        "ranked": {"pool_rank": 3, "octaves": 2},
     }.get(name)
     if changes is None:
         return save(path, name)
@@ -81,7 +81,8 @@ def folder(request, tmp_path_factory):
     evae = EventVAE(width=SIDE, height=SIDE, context=64, time_bins=32, **changes).freeze()
     for parameter in evae.ecn.layers.parameters():  # so that magnitudes outlive many ages
         parameter.data.mul_(3.0)
-    name, own = evae.settings.variant, {key: getattr(evae.settings, key) for key in ("coding", "pool_rank")}
+    name, keys = evae.settings.variant, ("coding", "pool_rank", "octaves")
+    own = {key: getattr(evae.settings, key) for key in keys}
     return save_policy(path, make_networks(name), make_spec(name, **own), ABOUT, evae)
 
 
