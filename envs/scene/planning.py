@@ -77,6 +77,25 @@ def cost_to_go(scene: Scene, radius_m: float, height_m: float = 2.0, through_x_m
     return CostToGo(_costs(prices), prices, first_x_m)
 
 
+def passable_among(scene: Scene, radius_m: float, height_m: float, speed_mps: float) -> bool:
+    """Whether the planner finds a way from every start among what stands and what moves from time 0 on.
+
+    Balls that are thrown do not count. As the planner, it takes a vehicle to be at each row when it would be
+    straight ahead, so a way is no proof for one that turns much.
+
+    Args:
+        scene: The corridor.
+        radius_m: Of the vehicle [m].
+        height_m: At which it flies [m].
+        speed_mps: At which it flies [m/s].
+    """
+    vehicle = radius_m, height_m, speed_mps
+    plan = cost_to_go(scene, radius_m, height_m).among(scene.moving, (0.0, 0.0), vehicle)
+    first, last = ((x_m - plan.first_x_m) / LATTICE_M for x_m in scene.spawn_range_m)
+    starts = plan.costs[0, max(0, math.floor(first)) : math.ceil(last) + 1]
+    return bool((starts < BLOCKED).all())
+
+
 def lattice_prices(
     scene: Scene, through_x_m: float, radius_m: float, height_m: float
 ) -> tuple[np.ndarray, float]:

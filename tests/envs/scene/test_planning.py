@@ -1,3 +1,4 @@
+import dataclasses
 import math
 
 import numpy as np
@@ -9,7 +10,7 @@ from hypothesis import strategies as st
 from envs.config import EnvConfig
 from envs.kinematics import Lane, advance, planned_position
 from envs.scene import ELLIPSOID, OBSTACLE, Scene, at_velocity, make_scene
-from envs.scene.planning import BLOCKED, LATTICE_M, SIDE_PRICE, CostToGo, _costs, cost_to_go
+from envs.scene.planning import BLOCKED, LATTICE_M, SIDE_PRICE, CostToGo, _costs, cost_to_go, passable_among
 
 RADIUS_M, HEIGHT_M = 0.3, 2.0
 SCENES = ("poles_eval", "gates", "shape_change", "dynamic")
@@ -161,3 +162,13 @@ def test_no_place_is_planned_that_the_vehicle_cannot_come_to():
     plan = cost_to_go(scene, RADIUS_M, HEIGHT_M)
     assert plan.costs.shape[1] * LATTICE_M == pytest.approx(2 * (10.0 + scene.length_m), abs=1.0)
     assert math.isfinite(plan.costs.max())
+
+
+@pytest.mark.parametrize(("leaves_at_mps", "expected"), [(0.0, False), (30.0, True)])
+def test_what_has_gone_when_the_vehicle_comes_blocks_no_way(leaves_at_mps, expected):
+    """A ball as wide as the lane, 50 m ahead of a vehicle at 10 m/s, stays or flies away upwards."""
+    ball = np.array([(ELLIPSOID, 0.0, 50.0, HEIGHT_M, 6.0, 6.0, 6.0, 0.5)], OBSTACLE)[0]
+    lane = Scene("lane", np.zeros(0, OBSTACLE), width_m=8.0, spawn_range_m=(-2.0, 2.0))
+    moving = dataclasses.replace(lane, moving=(at_velocity(ball, (0.0, 0.0, leaves_at_mps)),))
+    assert passable_among(lane, RADIUS_M, HEIGHT_M, 10.0)
+    assert passable_among(moving, RADIUS_M, HEIGHT_M, 10.0) is expected
