@@ -39,6 +39,7 @@ JOBS = {
     "late_actions": "study",
     "body_speed": "study",
     "body_kinds": "study",
+    "body_near": "study",
     "body_conditions": "study",
     "dodge": "study",
     "renderer": "study",
