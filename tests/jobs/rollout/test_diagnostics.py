@@ -94,3 +94,8 @@ def test_a_measurement_takes_no_random_number(evae):
 
 def test_the_drift_of_a_group_is_the_mean_of_the_trainings_that_have_an_encoder():
     assert mean_drift([{"drift": 1.0}, {"drift": 2.0}, {}]) == {"evae/drift": pytest.approx(1.5)}
+
+
+def test_what_only_a_simulator_knows_has_no_drift():
+    near = EventVAE(context=16, target="proximity").freeze()
+    assert drift_metrics(near, [window(50)], {"reconstruction_step": 0.25}) == {}
