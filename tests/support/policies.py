@@ -23,8 +23,7 @@ TRAINED = (
     *("bytestream", "event_columns", "event_columns_gru", "event_set"),
     *("event_image", "event_image_vae", "rgb", "finetuned"),
 )
-RECURRENT = ("event_columns_gru",)  # their logits depend on all steps; imitation refuses them
-TAUGHT = tuple(name for name in TRAINED if name not in RECURRENT)
+RECURRENT = ("event_columns_gru",)  # their logits depend on all steps; none is shipped
 
 # Kinds that share their networks with rgb, or their encoder with bytestream.
 ALIKE = ("event_image", "event_image_vae")

@@ -9,10 +9,13 @@ from ray.rllib.core.columns import Columns
 from torch import Tensor
 
 from envs.kinematics import MIRRORED_ACTIONS
+from jobs.training.ppo.losses import STARTS, TAKEN
+from jobs.training.sampling.env_runner import STATES
 
 SETTINGS = "imitation"  # key among the learner's settings: the fields of `ImitationConfig`, and env_steps
 COSTS = "costs"  # column of a step: cost of each action minus that of the cheapest, float32 (actions,)
 MIRRORED = "mirrored"  # column of a step: its observation with left and right exchanged
+NAMES = {"stacks": Columns.OBS, "costs": COSTS, "taken": TAKEN}  # stored name -> column that the loss reads
 
 
 def mirror_images(settings: Mapping[str, Any]) -> list[int]:
@@ -21,47 +24,86 @@ def mirror_images(settings: Mapping[str, Any]) -> list[int]:
     return MIRRORED_ACTIONS if mirrored is True else list(mirrored or [])
 
 
+def windows(rows: Mapping[str, Tensor], before: int, most: int) -> dict[str, Tensor]:
+    """Cut rows of successive steps into windows that a recurrent network reads from the state zero.
+
+    A window has up to `before` steps that only lead to the state, and up to `most` that are learnt from.
+    Steps that fewer precede in their piece of an episode are left out, unless the episode begins with it.
+
+    Args:
+        rows: Columns (N, ...), among them `STARTS`; and of the states before each step, `STATES`.
+        before: Steps.
+        most: Steps.
+
+    Returns:
+        Columns (C, before + most, ...) but the states, and `TAKEN`, of the steps that are learnt from.
+    """
+    steps, states = rows[STARTS], rows[STATES]
+    first = torch.nonzero(steps % most == 0)[:, 0]
+    ends = torch.cat([first[1:], torch.tensor([len(steps)])])
+    piece = first - steps[first]
+    known = ~states[piece].any(1) | (steps[first] >= before)  # only at the start of an episode is it zero
+    first, ends, piece = first[known], ends[known], piece[known]
+    places = torch.maximum(first - before, piece)[:, None] + torch.arange(before + most)
+    taken = (places >= first[:, None]) & (places < ends[:, None])
+    places = torch.minimum(places, ends[:, None] - 1)
+    return {name: column[places] for name, column in rows.items() if name != STATES} | {TAKEN: taken}
+
+
 class LabelledSteps:
-    """Steps with their labels, of all batches; beyond a bound, a uniform random sample of them."""
+    """Steps with their labels, of all batches; beyond a bound, a uniform random sample of them.
+
+    A row is a step, or a window of steps for a recurrent network.
+    """
 
     def __init__(self, most_bytes: float) -> None:
         self.most_bytes, self.seen = most_bytes, 0
-        self.stacks, self.costs = np.empty(0), np.empty(0)
+        self.columns: dict[str, np.ndarray] = {}
 
     def __len__(self) -> int:
-        return min(self.seen, len(self.stacks))
+        return min(self.seen, self._room)
 
-    def add(self, stacks: np.ndarray, costs: np.ndarray) -> None:
-        """Add steps (N, ...) and costs (N, actions); each step so far has the same chance to stay."""
+    def add(self, **columns: np.ndarray) -> None:
+        """Add rows: stacks (N, ...), costs (N, ..., actions), of windows taken (N, T).
+
+        Each row so far has the same chance to stay.
+        """
         if not self.seen:
-            self._allocate(stacks, costs)
-        numbers = self.seen + np.arange(len(stacks))
-        drawn = (torch.rand(len(stacks), dtype=torch.float64).numpy() * (numbers + 1)).astype(np.int64)
-        places = np.where(numbers < len(self.stacks), numbers, drawn)
-        kept = places < len(self.stacks)
-        self.stacks[places[kept]], self.costs[places[kept]] = stacks[kept], costs[kept]
-        self.seen += len(stacks)
+            self._allocate(columns)
+        numbers = self.seen + np.arange(len(columns["costs"]))
+        drawn = (torch.rand(len(numbers), dtype=torch.float64).numpy() * (numbers + 1)).astype(np.int64)
+        places = np.where(numbers < self._room, numbers, drawn)
+        kept = places < self._room
+        for name, column in self.columns.items():
+            column[places[kept]] = columns[name][kept]
+        self.seen += len(numbers)
 
     def draw(self, count: int) -> dict[str, Tensor]:
         """Return `count` random rows, with replacement."""
         rows = torch.randint(len(self), (count,))
-        columns = {Columns.OBS: self.stacks, COSTS: self.costs}
-        return {name: torch.from_numpy(column)[rows] for name, column in columns.items()}
+        return {NAMES[name]: torch.from_numpy(column)[rows] for name, column in self.columns.items()}
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return the whole state, for `load`."""
         size = len(self)
-        return {"stacks": self.stacks[:size], "costs": self.costs[:size], "seen": np.array(self.seen)}
+        return {name: column[:size] for name, column in self.columns.items()} | {"seen": np.array(self.seen)}
 
     def load(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Continue from the state of `arrays`."""
-        self.seen, size = int(arrays["seen"]), len(arrays["stacks"])
-        if size:
-            self._allocate(arrays["stacks"], arrays["costs"])
-            self.stacks[:size], self.costs[:size] = arrays["stacks"], arrays["costs"]
+        self.seen = int(arrays["seen"])
+        if self.seen:
+            stored = {name: arrays[name] for name in NAMES if name in arrays}
+            self._allocate(stored)
+            for name, column in stored.items():
+                self.columns[name][: len(column)] = column
 
-    def _allocate(self, stacks: np.ndarray, costs: np.ndarray) -> None:
+    @property
+    def _room(self) -> int:
+        return len(next(iter(self.columns.values()), ()))
+
+    def _allocate(self, columns: Mapping[str, np.ndarray]) -> None:
         """Reserve as many rows as the bound allows; pages that are never written cost no memory."""
-        most = max(1, int(self.most_bytes / (stacks[0].nbytes + costs[0].nbytes)))
-        self.stacks = np.empty((most, *stacks.shape[1:]), stacks.dtype)
-        self.costs = np.empty((most, *costs.shape[1:]), costs.dtype)
+        most = max(1, int(self.most_bytes / sum(column[0].nbytes for column in columns.values())))
+        self.columns = {
+            name: np.empty((most, *column.shape[1:]), column.dtype) for name, column in columns.items()
+        }

@@ -7,6 +7,9 @@ weights: networks that first learnt from few corridors generalise worse than net
 corridors from the start (Ash and Adams 2020). The value network learns nothing.
 
 With mirroring, each step is stored a second time with left and right exchanged, observation and label.
+
+A recurrent network learns from windows of steps (`labelled_steps.windows`). Each begins with the state zero,
+not with that in which the env runner acted: after the last batch the networks that made those are gone.
 """
 
 import copy
@@ -23,11 +26,22 @@ from ray.rllib.utils.metrics import NUM_ENV_STEPS_SAMPLED_LIFETIME
 from torch import Tensor
 from torch.nn.functional import cross_entropy
 
-from jobs.training.imitation.labelled_steps import COSTS, MIRRORED, SETTINGS, LabelledSteps, mirror_images
+from jobs.training.imitation.labelled_steps import (
+    COSTS,
+    MIRRORED,
+    SETTINGS,
+    LabelledSteps,
+    mirror_images,
+    windows,
+)
 from jobs.training.ppo.learner import PlainPPOLearner, shared_threads
+from jobs.training.ppo.losses import STARTS, TAKEN
+from jobs.training.sampling.env_runner import STATES
+from models.policy.rllib_module import SEQUENCE, STATE
 
 # Fraction of the newest steps in which the student's likeliest action is the cheapest.
 AGREEMENT_KEY = "agreement"
+BEFORE = 32  # steps that lead a recurrent network to its state before those that it learns from
 
 
 class ImitationLearner(PlainPPOLearner):
@@ -65,16 +79,19 @@ class ImitationLearner(PlainPPOLearner):
             Columns.OBS: [np.asarray(episode.get_observations())[:-1] for episode in episodes],
             Columns.ACTIONS: [episode.get_actions() for episode in episodes],
         }
-        for name in (Columns.ACTION_DIST_INPUTS, COSTS, *([MIRRORED] if self._mirrored else [])):
+        told = [Columns.ACTION_DIST_INPUTS, COSTS]
+        told += [MIRRORED] * bool(self._mirrored) + [STATES] * bool(self._policy.state_size)
+        for name in told:
             columns[name] = [episode.get_extra_model_outputs(name) for episode in episodes]
+        columns[STARTS] = [np.arange(len(episode)) for episode in episodes]
         return {name: torch.from_numpy(np.concatenate(parts)) for name, parts in columns.items()}
 
     def _improve(self, rows: dict[str, Tensor], num_epochs: int, minibatch_size: int) -> dict[str, Any]:
         """Take gradient steps on random rows of all steps so far; return the means of their figures."""
         likeliest, costs = rows[Columns.ACTION_DIST_INPUTS].argmax(1, keepdim=True), rows[COSTS]
-        self._steps.add(rows[Columns.OBS].numpy(), costs.numpy())
-        if self._mirrored:
-            self._steps.add(rows[MIRRORED].numpy(), costs.numpy()[:, self._mirrored])
+        if self._policy.state_size:
+            rows, minibatch_size = windows(rows, BEFORE, SEQUENCE), max(1, minibatch_size // SEQUENCE)
+        self._keep(rows)
         count = self._settings["final_steps" if self._last else "fit_steps"]
         optimizer = self.get_optimizer(DEFAULT_MODULE_ID)
         if self._last:
@@ -95,13 +112,26 @@ class ImitationLearner(PlainPPOLearner):
         means = {name: values.mean() for name, values in figures.items()}
         return means | {AGREEMENT_KEY: (costs.gather(1, likeliest) == 0.0).float().mean()}
 
+    def _keep(self, rows: Mapping[str, Tensor]) -> None:
+        """Add rows to the stored ones, and their mirror images if asked for."""
+        own = {"taken": rows[TAKEN].numpy()} if TAKEN in rows else {}
+        costs = rows[COSTS].numpy()
+        self._steps.add(stacks=rows[Columns.OBS].numpy(), costs=costs, **own)
+        if self._mirrored:
+            self._steps.add(stacks=rows[MIRRORED].numpy(), costs=costs[..., self._mirrored], **own)
+
     def _on_gpu(self) -> None:
         """Return None: the stored steps do not fit on the GPU."""
 
     def _loss(self, module: Any, rows: dict[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the cross-entropy of the labels softmax(-cost / temperature), and the policy's entropy."""
-        logits = module._forward_train(rows)[Columns.ACTION_DIST_INPUTS]
-        labels = torch.softmax(-rows[COSTS] / self._settings["temperature"], dim=-1)
+        taken = rows.get(TAKEN)
+        if taken is not None:
+            rows = {**rows, Columns.STATE_IN: {STATE: torch.zeros(len(taken), module.state_size)}}
+        logits, costs = module._forward_train(rows)[Columns.ACTION_DIST_INPUTS], rows[COSTS]
+        if taken is not None:
+            logits, costs = logits[taken], costs[taken]
+        labels = torch.softmax(-costs / self._settings["temperature"], dim=-1)
         loss = cross_entropy(logits, labels)
         logps = torch.log_softmax(logits.detach(), dim=-1)
         figures = {POLICY_LOSS_KEY: loss.detach(), ENTROPY_KEY: -(logps.exp() * logps).sum(-1).mean()}

@@ -109,6 +109,6 @@ def test_imitation_labels_each_command_and_exchanges_left_and_right():
     learner.update(
         episodes=episodes, timesteps={"num_env_steps_sampled_lifetime": 0}, num_epochs=1, minibatch_size=16
     )
-    size = len(costs)
-    assert np.array_equal(learner._steps.costs[size : 2 * size], learner._steps.costs[:size, ::-1])
+    size, kept = len(costs), learner._steps.columns["costs"]
+    assert np.array_equal(kept[size : 2 * size], kept[:size, ::-1])
     runner.stop()

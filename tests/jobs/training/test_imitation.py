@@ -17,7 +17,7 @@ from jobs.training.sampling.corridors import corridor_settings
 from models.kinds import KINDS
 from tests.support.configs import SHORT, make_config
 from tests.support.episodes import infos_of
-from tests.support.policies import TAUGHT, kinds
+from tests.support.policies import TRAINED, kinds
 from tests.support.runs import write_encoder
 
 WORDS = (*SHORT, "algo=imitation", "model=event_columns", "algo.num_env_runners=0", "train.env_steps=1000")
@@ -145,7 +145,7 @@ def test_labels_are_learnt(learner, rolled_out):
     assert losses[-1] < 0.8 * losses[0]
 
 
-@pytest.mark.parametrize("name", kinds([*TAUGHT, "own"], quick=("own",)))
+@pytest.mark.parametrize("name", kinds([*TRAINED, "own"], quick=("own",)))
 def test_mirrored_steps_are_what_the_policy_would_keep_of_mirrored_observations(name, tmp_path, monkeypatch):
     """And nothing else is rolled out than without them; RLlib's own pieces are cut alike."""
     own = {
@@ -241,22 +241,21 @@ def test_a_teacher_of_limited_sight_says_what_a_way_so_far_costs():
 
 def rows_of(first, count):
     numbers = np.arange(first, first + count)
-    return np.repeat(numbers[:, None], 3, axis=1).astype(np.int16), np.stack([numbers] * 3, 1).astype(
-        np.float32
-    )
+    stacks, costs = (np.stack([numbers] * 3, 1).astype(dtype) for dtype in (np.int16, np.float32))
+    return {"stacks": stacks, "costs": costs}
 
 
 def test_lessons_are_all_kept_up_to_a_bound_and_beyond_it_a_fair_sample():
     lessons = LabelledSteps(100 * (3 * 2 + 3 * 4))
     torch.manual_seed(0)
     for first in range(0, 80, 16):
-        lessons.add(*rows_of(first, 16))
+        lessons.add(**rows_of(first, 16))
     np.testing.assert_array_equal(lessons.arrays()["costs"][:, 0], np.arange(80))
     counts = np.zeros(400)
     for _ in range(100):
         lessons = LabelledSteps(100 * (3 * 2 + 3 * 4))
         for first in range(0, 400, 50):
-            lessons.add(*rows_of(first, 50))
+            lessons.add(**rows_of(first, 50))
         kept = lessons.arrays()["costs"][:, 0].astype(int)
         assert len(lessons) == len(set(kept)) == 100
         counts[kept] += 1
@@ -271,17 +270,17 @@ def test_lessons_are_all_kept_up_to_a_bound_and_beyond_it_a_fair_sample():
 def test_lessons_go_on_from_their_arrays(seen):
     lessons, again = LabelledSteps(100 * (3 * 2 + 3 * 4)), LabelledSteps(100 * (3 * 2 + 3 * 4))
     if seen:
-        lessons.add(*rows_of(0, seen))
+        lessons.add(**rows_of(0, seen))
     again.load(lessons.arrays())
     for one in (lessons, again):
         torch.manual_seed(5)
-        one.add(*rows_of(seen, 70))
+        one.add(**rows_of(seen, 70))
     assert lessons.seen == again.seen == seen + 70
     for name, value in lessons.arrays().items():
         np.testing.assert_array_equal(value, again.arrays()[name])
 
 
-@pytest.mark.parametrize("name", kinds(TAUGHT, quick=("bytestream",)))
+@pytest.mark.parametrize("name", kinds(TRAINED, quick=("bytestream",)))
 def test_every_kind_of_policy_can_be_taught(name, tmp_path):
     own = "model.encoder=finetuned" if name == "finetuned" else f"model={name}"
     few = "algo.imitation.fit_steps=2", "algo.minibatch_size=8"

@@ -7,12 +7,14 @@ from ray.rllib.algorithms.ppo.torch.ppo_torch_learner import PPOTorchLearner
 from ray.rllib.core.columns import Columns
 from ray.rllib.env.utils.infinite_lookback_buffer import InfiniteLookbackBuffer
 
-from jobs.config.config import ConfigError
 from jobs.training.algorithms import build_algorithm
+from jobs.training.imitation.env_runner import TaughtEnvRunner
+from jobs.training.imitation.labelled_steps import windows
+from jobs.training.imitation.learner import BEFORE
 from jobs.training.ppo.learner import REWARD_SCALE, PlainPPOLearner, _minibatch
 from jobs.training.ppo.losses import FIRST_ROW, STARTS, TAKEN, sequences
 from jobs.training.sampling.env_runner import STATES, PlainEnvRunner
-from models.policy.rllib_module import STATE
+from models.policy.rllib_module import SEQUENCE, STATE
 from tests.support.configs import SHORT, make_config
 
 GRU = *SHORT, "model=event_columns_gru", "model.units=8"
@@ -135,6 +137,51 @@ def test_a_runner_resumes_with_the_states_of_its_episodes(sampled):
             np.testing.assert_array_equal(a, b)
 
 
-def test_imitation_refuses_a_recurrent_policy():
-    with pytest.raises(ConfigError, match=r"^model\.name: must be a policy without a recurrent network"):
-        build_algorithm(make_config("model=event_columns_gru", "algo=imitation"))
+def test_windows_hold_each_step_once_behind_what_leads_to_its_state():
+    """Of pieces of 5 steps at the start of an episode, of 7 within one, and of 2 at the start."""
+    steps = torch.tensor([*range(5), *range(7), *range(2)])
+    states = torch.ones(14, 3)
+    states[[0, 12]] = 0.0
+    rows = {STARTS: steps, "number": torch.arange(14), STATES: states}
+    cut = windows(rows, before=2, most=2)
+    assert cut["number"].shape == cut[TAKEN].shape == (7, 4)
+    numbers = [number[taken].tolist() for number, taken in zip(cut["number"], cut[TAKEN], strict=True)]
+    assert numbers == [[0, 1], [2, 3], [4], [7, 8], [9, 10], [11], [12, 13]]  # 5 and 6 have too little before
+    assert cut["number"][:, 0].tolist() == [0, 0, 2, 5, 7, 9, 12]
+
+
+def test_a_window_at_the_start_of_an_episode_repeats_the_decisions_of_the_env_runner():
+    runner, learner = taught()
+    episodes = runner.sample(num_timesteps=300)
+    rows = learner._rows(episodes)
+    module = learner.module["default_policy"].unwrapped()
+    module.load_state_dict(runner.module.state_dict(), strict=False)
+    cut = windows(rows, BEFORE, SEQUENCE)
+    state = torch.zeros(len(cut[TAKEN]), module.state_size)
+    batch = {Columns.OBS: cut[Columns.OBS], Columns.STATE_IN: {STATE: state}}
+    with torch.no_grad():
+        logits = module._forward_train(batch)[Columns.ACTION_DIST_INPUTS]
+    expected = cut[Columns.ACTION_DIST_INPUTS]
+    assert cut[TAKEN].sum() > 200
+    torch.testing.assert_close(logits[cut[TAKEN]], expected[cut[TAKEN]], rtol=1e-4, atol=1e-5)
+    runner.stop()
+
+
+def test_a_recurrent_policy_learns_what_a_teacher_says():
+    runner, learner = taught("algo.imitation.fit_steps=150", "algo.lr=3e-3", "algo.mirrored=true")
+    episodes = runner.sample(num_timesteps=600)
+    rows = windows(learner._rows(episodes), BEFORE, SEQUENCE)
+    module = learner.module["default_policy"].unwrapped()
+    before = float(learner._loss(module, rows)[0].detach())
+    learner.update(episodes=episodes, timesteps={"num_env_steps_sampled_lifetime": 1}, minibatch_size=256)
+    assert float(learner._loss(module, rows)[0].detach()) < 0.8 * before
+    assert learner._steps.seen == 2 * len(rows[TAKEN])
+    runner.stop()
+
+
+def taught(*words):
+    few = "algo.num_env_runners=0", "train.env_steps=1000"
+    config = make_config(*GRU, "algo=imitation", *few, *words)
+    ppo = build_algorithm(config)
+    runner = TaughtEnvRunner(config=ppo, worker_index=0)
+    return runner, ppo.build_learner(env=runner.env)
