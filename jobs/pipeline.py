@@ -25,7 +25,7 @@ def run(config: Config) -> dict[str, float]:
     config = folder.config
     console.print(f"Run folder: {folder.path}")
     with open_tracker(config, folder) as tracker:
-        train(config, folder, prepare_inputs(config, folder, tracker), tracker.log)
+        train(folder, prepare_inputs(folder, tracker), tracker.log)
         metrics = evaluate(config, folder, tracker)
         console.print(f"Registered: {register_training(tracker, folder.path)}")
         console.print(tracker.dashboard())

@@ -72,19 +72,19 @@ class Settings:
 def run(config: Config) -> dict[str, float]:
     """Train the encoder of the run if there is none yet, then compare codings; return the metrics."""
     folder = open_run(config)
-    config = folder.config
-    with open_tracker(config, folder) as tracker:
-        prepare_encoder(config, folder, tracker)
+    with open_tracker(folder.config, folder) as tracker:
+        prepare_encoder(folder, tracker)
         evae, _ = load_encoder(encoder_file(folder))
-        metrics = trade_coding(config, folder, tracker) | show_latent(config, folder, tracker, evae)
-        trade_contexts(config, folder, tracker, evae)
+        metrics = trade_coding(folder, tracker) | show_latent(folder, tracker, evae)
+        trade_contexts(folder, tracker, evae)
         tracker.log(0, metrics)
     return finish(folder, "codings", metrics)
 
 
-def trade_contexts(config: Config, folder: Run, tracker: Tracker, evae: EventVAE) -> None:
+def trade_contexts(folder: Run, tracker: Tracker, evae: EventVAE) -> None:
     """Train each size of the context briefly, and measure all encodings together with those of the run."""
-    models = [trained(config, folder, {"context": size}, 0) for size in CONTEXTS]
+    config = folder.config
+    models = [trained(folder, {"context": size}, 0) for size in CONTEXTS]
     validation = read_recording(data_file(folder, "validation"))
     count = config.own.windows
     usual = draw(config, validation, "mixed", MAX_EVENTS, count)
@@ -104,16 +104,16 @@ def sized_encoding(evae: EventVAE) -> Encoding:
     return Encoding("context", str(evae.settings.context), encode_whole(EncoderTable.from_evae(evae)), evae)
 
 
-def trade_coding(config: Config, folder: Run, tracker: Tracker) -> dict[str, float]:
+def trade_coding(folder: Run, tracker: Tracker) -> dict[str, float]:
     """Train each coding of time side by side; return what each explains, as means over seeds."""
-    trade = config.own
+    config, trade = folder.config, folder.config.own
     validation = read_recording(data_file(folder, "validation"))
     shares: dict[str, dict[str, list[float]]] = {coding: {} for coding in CODINGS}
     models: dict[str, EventVAE] = {}
     for seed in range(trade.seeds):
         for coding in CODINGS:
             changes = {"variant": "bytestream", "context": CODING_CONTEXT, "coding": coding}
-            evae = trained(config, folder, changes, seed)
+            evae = trained(folder, changes, seed)
             models.setdefault(coding, evae)
             conditions = held_out(config, validation, evae.grid, trade.windows)
             for name, batch in conditions.items():
@@ -134,8 +134,9 @@ def trade_coding(config: Config, folder: Run, tracker: Tracker) -> dict[str, flo
     }
 
 
-def show_latent(config: Config, folder: Run, tracker: Tracker, evae: EventVAE) -> dict[str, float]:
+def show_latent(folder: Run, tracker: Tracker, evae: EventVAE) -> dict[str, float]:
     """Draw the code of time, pictures between latents, and other scenes; return what is explained."""
+    config = folder.config
     publish_plot(folder, tracker, "trade/embedding", plot_embedding())
     validation = read_recording(data_file(folder, "validation"))
     batch = held_out_windows(validation, config.pretrain, evae.settings)["four_steps"][0]

@@ -19,17 +19,18 @@ from models.kinds import EvaeSettings
 MAX_EVENTS = 4096
 
 
-def trained(config: Config, folder: Run, changes: Mapping[str, Any], seed: int) -> EventVAE:
+def trained(folder: Run, changes: Mapping[str, Any], seed: int) -> EventVAE:
     """A frozen event VAE after a short training with some settings of the model changed.
 
     The same seed gives the same windows, whatever is changed. A training that was finished
     before is read from the run folder.
     """
+    config = folder.config
     settings = trial_settings(config, changes)
     iterations = config.own.iterations
     name = f"{settings.variant}-{settings.coding}-{settings.context}-s{seed}-{iterations}"
     file = folder.path / "trade" / "encoders" / f"{name}.safetensors"
-    return kept(config, folder, file, settings, seed, iterations)
+    return kept(folder, file, settings, seed, iterations)
 
 
 def trial_settings(config: Config, changes: Mapping[str, Any]) -> EvaeSettings:
@@ -38,10 +39,9 @@ def trial_settings(config: Config, changes: Mapping[str, Any]) -> EvaeSettings:
     return changed
 
 
-def kept(
-    config: Config, folder: Run, file: Path, settings: EvaeSettings, seed: int, iterations: int
-) -> EventVAE:
+def kept(folder: Run, file: Path, settings: EvaeSettings, seed: int, iterations: int) -> EventVAE:
     """The frozen event VAE of a file, trained briefly on the run's recordings if it is not there yet."""
+    config = folder.config
     if not file.with_suffix(".json").exists():
         train = read_recording(data_file(folder, "train"))
         evae = train_short(config, train, settings, seed, iterations, f"Train {file.stem}")

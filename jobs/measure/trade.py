@@ -139,7 +139,7 @@ def run(config: Config, executor: Executor | None = None) -> dict[str, float]:
                         f"{what}: not evaluated: {failed[task.key]}; the same command tries again"
                     )
         traded = [row for rows in measure_plans(config, plans, results) for row in rows]
-        write_trade(folder, tracker, traded, facts_of(config, folder, policies, reasons))
+        write_trade(folder, tracker, traded, facts_of(folder, policies, reasons))
         tracker.log(0, trade_metrics(traded[0]))
         console.print(tracker.dashboard(), markup=False)
     return finish(folder, "trade", trade_metrics(traded[0]))
@@ -322,11 +322,9 @@ def speed_ratio(ratios: Sequence[float]) -> Estimate:
     return Estimate(float(np.exp(centre)), (float(np.exp(centre - half)), float(np.exp(centre + half))))
 
 
-def facts_of(
-    config: Config, folder: Run, policies: Sequence[EvaluatedPolicy], failed: Mapping[str, str]
-) -> TradeFacts:
+def facts_of(folder: Run, policies: Sequence[EvaluatedPolicy], failed: Mapping[str, str]) -> TradeFacts:
     """Return where the numbers come from."""
-    trade = config.own
+    trade = folder.config.own
     return {
         "run": folder.path.name,
         "command": command(),
@@ -335,7 +333,7 @@ def facts_of(
         "policies": dict(Counter(policy.group for policy in policies)),
         "scenes": list(dict.fromkeys(trade.scenes)),
         "met": met_fidelity(policies),
-        "action": config.evaluate.action,
+        "action": folder.config.evaluate.action,
         "trials": trade.trials,
         "pyrender_trials": min(trade.trials, trade.pyrender_trials),
         "replays": trade.replays,

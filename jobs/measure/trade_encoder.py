@@ -72,18 +72,17 @@ def run(config: Config) -> dict[str, float]:
         raise ConfigError("model.coding: must be additive or none for this study, got 'eventnet'")
     check_sources(config)
     folder = open_run(config)
-    config = folder.config
-    with open_tracker(config, folder) as tracker:
-        prepare_encoder(config, folder, tracker)
+    with open_tracker(folder.config, folder) as tracker:
+        prepare_encoder(folder, tracker)
         evae, _ = load_encoder(encoder_file(folder))
-        metrics = trade_inference(config, folder, tracker, evae)
+        metrics = trade_inference(folder, tracker, evae)
         tracker.log(0, metrics)
     return finish(folder, "trade_encoder", metrics)
 
 
-def trade_inference(config: Config, folder: Run, tracker: Tracker, evae: EventVAE) -> dict[str, float]:
+def trade_inference(folder: Run, tracker: Tracker, evae: EventVAE) -> dict[str, float]:
     """Measure cost against error of every way to encode; return the metrics of the default."""
-    trade = config.own
+    config, trade = folder.config, folder.config.own
     validation = read_recording(data_file(folder, "validation"))
     usual = draw(config, validation, "mixed", MAX_EVENTS, trade.windows)
     dense = draw(config, validation, "count", DENSE_EVENTS, trade.windows)

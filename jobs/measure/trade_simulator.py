@@ -71,15 +71,16 @@ def run(config: Config) -> dict[str, float]:
     with open_tracker(config, folder) as tracker:
         metrics: dict[str, float] = {}
         for scene in config.own.scenes:
-            metrics |= trade_scene(config, folder, tracker, scene)
-        metrics |= trade_memory(config, folder, tracker)
+            metrics |= trade_scene(folder, tracker, scene)
+        metrics |= trade_memory(folder, tracker)
         tracker.log(0, metrics)
         console.print(tracker.dashboard(), markup=False)
     return finish(folder, "trade_simulator", metrics)
 
 
-def trade_scene(config: Config, folder: Run, tracker: Tracker, scene: str) -> dict[str, float]:
+def trade_scene(folder: Run, tracker: Tracker, scene: str) -> dict[str, float]:
     """Measure cost and error of every setting in one scene; return the metrics of the default."""
+    config = folder.config
     default = dataclasses.replace(config.env, scene=scene, split="validation", observation="events")
     named = [("default", "", default)]
     for knob, settings in KNOBS.items():
@@ -108,9 +109,9 @@ def trade_scene(config: Config, folder: Run, tracker: Tracker, scene: str) -> di
     }
 
 
-def trade_memory(config: Config, folder: Run, tracker: Tracker) -> dict[str, float]:
+def trade_memory(folder: Run, tracker: Tracker) -> dict[str, float]:
     """Measure events per second of flight at each control rate for each memory mode; return the metrics."""
-    trade = config.own
+    config, trade = folder.config, folder.config.own
     rates_hz = trade.control_hz
     events_hz: dict[str, list[float]] = {memory: [] for memory in MEMORIES}
     with progress("Memory modes", len(rates_hz) * len(MEMORIES), "simulations") as advance:

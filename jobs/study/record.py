@@ -12,7 +12,6 @@ import numpy as np
 from jobs.analysis.plots import style_of
 from jobs.analysis.tables import estimate_text, markdown_table, save_plot, show_table
 from jobs.config.conditions import NOMINAL, axis_numbers
-from jobs.config.config import Config
 from jobs.evaluation.evaluate import VIEW_COLUMNS, film_episode
 from jobs.rollout.diagnostics import mean_drift
 from jobs.rollout.policies import own_sensor_differences
@@ -95,13 +94,12 @@ class Evaluated:
 
 
 def record(
-    config: Config, folder: Run, place: Path, tracker: Tracker, found: Evaluated, times: Mapping[str, float]
+    folder: Run, place: Path, tracker: Tracker, found: Evaluated, times: Mapping[str, float]
 ) -> dict[str, float]:
     """Write plots, tables and tracked runs of a study; return each group's success rate by condition.
 
     Args:
-        config: The experiment.
-        folder: Its run folder.
+        folder: The run folder.
         place: The folder in it that holds the study.
         tracker: Its MLflow run.
         found: What was evaluated.
@@ -114,9 +112,9 @@ def record(
     }
     write_episodes(place / "episodes.csv", LABELS, episodes)
     tracker.artifact(place / "episodes.csv", "sweep")
-    facts = facts_of(config, folder, found)
+    facts = facts_of(folder, found)
     results = Results(json.loads(json.dumps(facts)), found.cells)
-    study = compute(config.exp, asdict(config.own), results, [], None)
+    study = compute(folder.config.exp, asdict(folder.config.own), results, [], None)
     for path in write_plots(place, study):
         tracker.artifact(path, "sweep")
     for path in film_crashes(place, found):
@@ -130,9 +128,9 @@ def record(
     return {one.name: one.success.value for one in study.summaries}
 
 
-def facts_of(config: Config, folder: Run, found: Evaluated) -> dict[str, Any]:
+def facts_of(folder: Run, found: Evaluated) -> dict[str, Any]:
     """Return what made the results: command, commits and date, policies and axes; no path of a machine."""
-    plan, study = found.plan, config.own
+    plan, config, study = found.plan, folder.config, folder.config.own
     return {
         **provenance(),
         "run": folder.path.name,

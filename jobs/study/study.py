@@ -59,17 +59,17 @@ def run(config: Config, executor: Executor | None = None) -> dict[str, float]:
         times = {name: float(np.mean(own)) for name, own in each.items()}
     trained = [dataclasses.replace(read_policy(str(place)), group=name, training=seed)
                for (name, seed), place in places.items()]  # fmt: skip
-    return evaluate(config, folder, [*taken, *trained], times, executor)
+    return evaluate(folder, [*taken, *trained], times, executor)
 
 
 def evaluate(
-    config: Config,
     folder: Run,
     policies: list[EvaluatedPolicy],
     times: dict[str, float],
     executor: Executor | None,
 ) -> dict[str, float]:
     """Evaluate all policies in the same corridors, and report; `times` [min] may be empty."""
+    config = folder.config
     plan = plan_study(config, policies)
     announce(plan)
     place = next(
@@ -77,14 +77,12 @@ def evaluate(
     )
     store, executor = EpisodeStore(place), executor or default_executor(config.cluster, place)
     planned = Evaluated(plan, store, {}, {})
-    families_of(
-        dataclasses.asdict(config.own), Results(facts_of(config, folder, planned), {})
-    )  # refuses first
+    families_of(dataclasses.asdict(config.own), Results(facts_of(folder, planned), {}))  # refuses first
     kind = "ablation" if config.own.variants else "sweep"  # as earlier versions tag their runs
     with open_tracker(config, folder, key=f"{kind} {plan.identity[:8]}") as tracker:
         tracker.tags({"kind": kind, "groups": ", ".join(plan.groups)})
         found = Evaluated(plan, store, *evaluate_tasks(plan.tasks, store, executor, "Study"))
-        rates = record(config, folder, place, tracker, found, times)
+        rates = record(folder, place, tracker, found, times)
         console.print(tracker.dashboard(), markup=False)
     return finish(folder, "study", rates)
 

@@ -77,7 +77,7 @@ def validation_tasks(policy: EvaluatedPolicy, action: str, trained: EnvConfig) -
     return tasks
 
 
-def validate(config: Config, folder: Run, policies: Mapping[int, Path]) -> dict[int, tuple[float, float]]:
+def validate(folder: Run, policies: Mapping[int, Path]) -> dict[int, tuple[float, float]]:
     """Return seed -> success [-] and mean distance [m] of each candidate in all of its tasks.
 
     Episodes are kept in the run folder: a stopped validation continues.
@@ -85,7 +85,7 @@ def validate(config: Config, folder: Run, policies: Mapping[int, Path]) -> dict[
     Raises:
         RuntimeError: A task failed.
     """
-    place = folder.path / "candidates" / "validation"
+    config, place = folder.config, folder.path / "candidates" / "validation"
     tasks = {
         seed: validation_tasks(read_policy(str(policy)), config.evaluate.action, config.env)
         for seed, policy in policies.items()

@@ -44,14 +44,15 @@ def run(config: Config) -> dict[str, float]:
     check_collect(locate_run(config))
     folder = open_run(config)
     with open_tracker(folder.config, folder) as tracker:
-        return collect(folder.config, folder, tracker)
+        return collect(folder, tracker)
 
 
-def collect(config: Config, folder: Run, tracker: Tracker) -> dict[str, float]:
+def collect(folder: Run, tracker: Tracker) -> dict[str, float]:
     """Write the training and validation recordings of a run, unless they are there already."""
     done = finished(folder, "collect")
     if done is not None:
         return done
+    config = folder.config
     policy, recorded = check_collect(folder)
     sizes: dict[Split, int] = {
         "train": config.collect.num_steps,

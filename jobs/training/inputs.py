@@ -44,10 +44,10 @@ def check_cpus(config: Config) -> None:
         raise ConfigError(f"algo.num_env_runners: {rule}, got {needed}")
 
 
-def prepare_inputs(config: Config, folder: Run, tracker: Tracker) -> Path | None:
+def prepare_inputs(folder: Run, tracker: Tracker) -> Path | None:
     """Copy the policy to begin from, or make the encoder; the encoder's file, or None without one."""
-    if config.train.init is None:
-        return prepare_encoder(config, folder, tracker)
+    if folder.config.train.init is None:
+        return prepare_encoder(folder, tracker)
     source, policy = check_init(folder)
     if source != folder.init:
         parent = tracker.of(source.parent).run_id

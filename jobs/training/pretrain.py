@@ -74,9 +74,8 @@ def run(config: Config) -> dict[str, float]:
         raise ConfigError(f"model: {name} has no event VAE to pretrain; go on with job=train")
     check_sources(config)
     folder = open_run(config)
-    config = folder.config
-    with open_tracker(config, folder) as tracker:
-        prepare_encoder(config, folder, tracker)
+    with open_tracker(folder.config, folder) as tracker:
+        prepare_encoder(folder, tracker)
     return finished(folder, "pretrain") or {}
 
 
@@ -121,21 +120,21 @@ def initial_state(folder: Run) -> dict[str, torch.Tensor] | None:
     return evae.state_dict()
 
 
-def prepare_encoder(config: Config, folder: Run, tracker: Tracker) -> Path | None:
+def prepare_encoder(folder: Run, tracker: Tracker) -> Path | None:
     """Collect and pretrain what is not there yet; the encoder file, or None if the policy has no encoder."""
-    if not KINDS[config.model.name].encoder:
+    if not KINDS[folder.config.model.name].encoder:
         return None
-    collect(config, folder, tracker)
-    pretrain(config, folder, tracker)
+    collect(folder, tracker)
+    pretrain(folder, tracker)
     return encoder_file(folder)
 
 
-def pretrain(config: Config, folder: Run, tracker: Tracker) -> dict[str, float]:
+def pretrain(folder: Run, tracker: Tracker) -> dict[str, float]:
     """Train an event VAE on the run's recordings and write its encoder file."""
     done = finished(folder, "pretrain")
     if done is not None:
         return done
-    settings = config.pretrain
+    config, settings = folder.config, folder.config.pretrain
     check_data(folder)
     (train, true), (validation, validation_true) = (
         read_split(folder, split, settings.denoise) for split in SPLITS

@@ -111,28 +111,28 @@ def run(config: Config) -> dict[str, float]:
     """Collect and pretrain where the policy needs that and it is not done; train; return the figures."""
     check_inputs(config)
     folder = open_run(config)
-    config = folder.config
-    with open_tracker(config, folder) as tracker:
-        train(config, folder, prepare_inputs(config, folder, tracker), tracker.log)
+    with open_tracker(folder.config, folder) as tracker:
+        train(folder, prepare_inputs(folder, tracker), tracker.log)
     return finished(folder, "train") or {}
 
 
-def train(config: Config, folder: Run, encoder_path: Path | None, on_result: OnResult) -> Path:
+def train(folder: Run, encoder_path: Path | None, on_result: OnResult) -> Path:
     """Train as `train_one` does; of several `train.candidates` the best becomes the run's policy.
 
     Candidates share the run's encoder. Each has a folder in the run folder, where a stopped one continues.
     """
     if finished(folder, "train") is not None:
         return folder.policy
+    config = folder.config
     if config.train.candidates == 1:
-        return train_one(config, folder, encoder_path, on_result)
+        return train_one(folder, encoder_path, on_result)
     runs = {seed: candidate_run(folder, seed) for seed in candidate_seeds(config)}
     for seed, own in runs.items():
         console.print(f"Candidate with seed {seed}, one of {len(runs)}")
         if folder.init.is_dir():
             shutil.copytree(folder.init, own.init, dirs_exist_ok=True)
-        train_one(own.config, own, encoder_path, lambda _steps, _metrics: None)
-    rates = validate(config, folder, {seed: own.policy for seed, own in runs.items()})
+        train_one(own, encoder_path, lambda _steps, _metrics: None)
+    rates = validate(folder, {seed: own.policy for seed, own in runs.items()})
     best = best_of(rates)
     show(rates, best)
     for row in take(folder, runs[best], rates):
@@ -141,11 +141,10 @@ def train(config: Config, folder: Run, encoder_path: Path | None, on_result: OnR
     return folder.policy
 
 
-def train_one(config: Config, folder: Run, encoder_path: Path | None, on_result: OnResult) -> Path:
+def train_one(folder: Run, encoder_path: Path | None, on_result: OnResult) -> Path:
     """Train until `train.env_steps`, from the newest checkpoint if there is one; export the policy.
 
     Args:
-        config: The experiment.
         folder: The run folder.
         encoder_path: The pretrained encoder's file; None for a policy without one.
         on_result: Called with (environment steps, metrics) after each iteration, in this
@@ -159,12 +158,13 @@ def train_one(config: Config, folder: Run, encoder_path: Path | None, on_result:
     """
     if finished(folder, "train") is not None:
         return folder.policy
+    config = folder.config
     check_cpus(config)
     start_ray(config.cluster, folder.path)
     init = folder.init / NETWORKS if config.train.init else None
     built = algorithm_of(config).build(config, encoder_path, init)
-    with _listening(config, folder, on_result) as last:
-        results = fit(_tuner(config, folder, built))
+    with _listening(folder, on_result) as last:
+        results = fit(_tuner(folder, built))
     if results.errors:
         raise TrainingError(stopped(results.errors[0]))
     figures = {name: value for name, value in last.items() if math.isfinite(value)}
@@ -212,8 +212,9 @@ def export_policy(
     save_policy(target, networks, spec, about, evae, of_encoder.get("figures"))
 
 
-def _tuner(config: Config, folder: Run, built: Any) -> tune.Tuner:
+def _tuner(folder: Run, built: Any) -> tune.Tuner:
     """Return the experiment in the run folder: the one that is there, else a new one."""
+    config = folder.config
     path, trainable = storage(config.cluster, folder.train), algorithm_of(config).trainable(config)
     if can_continue(path, folder.train):
         stopped_at = restored(path, trainable, built).get_results()[0].checkpoint
@@ -278,9 +279,9 @@ def restored(path: str, trainable: type, built: Any) -> tune.Tuner:
 
 
 @contextlib.contextmanager
-def _listening(config: Config, folder: Run, on_result: OnResult) -> Iterator[dict[str, float]]:
+def _listening(folder: Run, on_result: OnResult) -> Iterator[dict[str, float]]:
     """Record, show and pass on each new result; yields the newest metrics, kept up to date."""
-    file = folder.train / "results.jsonl"
+    config, file = folder.config, folder.train / "results.jsonl"
     reported, last = reported_so_far(file)
     algorithm, total, since_s = algorithm_of(config), config.train.env_steps, time.monotonic()
     with progress("Train the policy", total, "steps", done=reported) as advance:

@@ -111,10 +111,10 @@ def run(config: Config) -> dict[str, float]:
     folder = open_run(config)
     config = folder.config
     with open_tracker(config, folder) as tracker:
-        prepare_encoder(config, folder, tracker)
+        prepare_encoder(folder, tracker)
         own, _ = load_encoder(encoder_file(folder))
         train, held_out = record_both(config)
-        rows = probe_representations(config, representations(config, folder, own), train, held_out)
+        rows = probe_representations(config, representations(folder, own), train, held_out)
         title = (
             f"Proximity read from each representation [%], and error of the bearing of obstacles within "
             f"{ALARM_M:g} m; {len(np.unique(held_out.episode))} episodes, 95 % intervals"
@@ -147,9 +147,9 @@ def record_both(config: Config) -> tuple[ProbeData, ProbeData]:
     return train, held_out
 
 
-def representations(config: Config, folder: Run, own: EventVAE) -> list[Representation]:
+def representations(folder: Run, own: EventVAE) -> list[Representation]:
     """The representations to compare; the event VAEs among them are trained, or read if they were before."""
-    grid, settings = own.grid, config.own
+    grid, settings = own.grid, folder.config.own
     compared = [
         Representation("nothing", [nothing]),
         Representation("image columns", [functools.partial(column_features, grid=grid)]),
@@ -160,18 +160,18 @@ def representations(config: Config, folder: Run, own: EventVAE) -> list[Represen
     compared.append(Representation(OWN, [functools.partial(latents, evae=own)]))
     for target in settings.targets:
         for latent in settings.latents:
-            models = [trained(config, folder, latent, target, seed) for seed in range(settings.seeds)]
+            models = [trained(folder, latent, target, seed) for seed in range(settings.seeds)]
             represent = [functools.partial(latents, evae=evae) for evae in models]
             compared.append(Representation(f"{target}, latent {latent}", represent, (latent, target)))
     return compared
 
 
-def trained(config: Config, folder: Run, latent: int, target: str, seed: int) -> EventVAE:
+def trained(folder: Run, latent: int, target: str, seed: int) -> EventVAE:
     """An event VAE of that latent size and target, trained briefly; the same seed gives the same windows."""
-    iterations = config.own.iterations
+    config, iterations = folder.config, folder.config.own.iterations
     file = folder.path / "probe" / "encoders" / f"{target}-{latent}-s{seed}-{iterations}.safetensors"
     settings = trial_settings(config, {"latent": latent, "target": target})
-    return kept(config, folder, file, settings, seed, iterations)
+    return kept(folder, file, settings, seed, iterations)
 
 
 def probe_representations(

@@ -88,7 +88,7 @@ def run(config: Config) -> dict[str, float]:
     name = place_name(config.own)
     with open_tracker(config, folder, key=name) as tracker:
         tracker.tags({"kind": "tune"})
-        files = _inputs(config, folder, tracker)
+        files = _inputs(folder, tracker)
         begun = earlier_trials(folder, config.own)
         rows = search(config, folder.path / name, files, tracker, begun)
         best = report(folder, name, rows, tracker)
@@ -97,14 +97,15 @@ def run(config: Config) -> dict[str, float]:
     return finish(folder, name, figures)
 
 
-def _inputs(config: Config, folder: Run, tracker: Tracker) -> Files:
+def _inputs(folder: Run, tracker: Tracker) -> Files:
     """Return the encoder that trials share, unless each has its own; the policy that they begin from."""
+    config = folder.config
     facts = encoder_facts(config)
     points = [{key: value} for key, values in config.own.space.items() for value in extremes(values)]
     if facts is not None and any(encoder_facts(with_settings(config, point)) != facts for point in points):
         console.print("The space changes the encoder: each trial collects and pretrains its own.")
         return {}
-    encoder = prepare_inputs(config, folder, tracker)
+    encoder = prepare_inputs(folder, tracker)
     files = [] if encoder is None else [encoder.with_name(name) for name in ENCODER_FILES]
     files += [folder.init / NETWORKS] if config.train.init is not None else []
     return {file.name: file.read_bytes() for file in files}

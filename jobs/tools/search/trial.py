@@ -58,7 +58,7 @@ class SearchTrial(Trainable):
         self._encoder = place / "inputs" / ENCODER if ENCODER in files and shared else None
         if not shared:
             own = Run(place / "run", self._experiment)
-            self._encoder = prepare_encoder(self._experiment, own, cast(Tracker, Unrecorded()))
+            self._encoder = prepare_encoder(own, cast(Tracker, Unrecorded()))
         init = place / "inputs" / NETWORKS if NETWORKS in files else None
         self._algorithm = algorithm_of(self._experiment)
         built = self._algorithm.build(self._experiment, self._encoder, init)

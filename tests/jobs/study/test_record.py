@@ -20,7 +20,7 @@ from tests.support.runs import planned
 
 def published(config, found):
     """The results as their files have them."""
-    return Results(json.loads(json.dumps(facts_of(config, open_run(config), found))), found.cells)
+    return Results(json.loads(json.dumps(facts_of(open_run(config), found))), found.cells)
 
 
 def results_of(sweep, episodes, folder):
@@ -104,7 +104,7 @@ def test_what_made_a_sweep_is_told_without_a_place_of_this_machine(tmp_path, mon
     monkeypatch.setattr("sys.argv", words)
     config = sweep_config(tmp_path)
     sweep = planned(config, "straight")
-    found = facts_of(config, open_run(config), results_of(sweep, {sweep.tasks[0].key: flights(1)}, tmp_path))
+    found = facts_of(open_run(config), results_of(sweep, {sweep.tasks[0].key: flights(1)}, tmp_path))
     assert found["evaluated_at"] == ["c0ffee"]
     assert found["command"] == "python -m platform.launch +exp=robustness 'study.policies=[mine,oracle]'"
     assert str(tmp_path) not in str(found)

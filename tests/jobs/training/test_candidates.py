@@ -68,7 +68,8 @@ def trained(monkeypatch):
     """Let a training be the copy of a shipped one; return the trained seeds, and those at which it stops."""
     seeds, stops = [], set()
 
-    def train_one(config, folder, encoder_path, on_result):
+    def train_one(folder, encoder_path, on_result):
+        config = folder.config
         if finished(folder, "train") is not None:
             return
         if config.seed in stops:
@@ -90,14 +91,13 @@ def trained(monkeypatch):
 
 def test_the_best_is_shipped_and_says_so_and_a_stopped_choice_goes_on(tmp_path, trained, capsys):
     seeds, stops = trained
-    config = config_of(tmp_path, 3, "env.time_limit_s=0.5")
-    folder, rows = open_run(config), []
+    folder, rows = open_run(config_of(tmp_path, 3, "env.time_limit_s=0.5")), []
     stops.add(8)
     with pytest.raises(KeyboardInterrupt):
-        training.train(config, folder, None, lambda *row: rows.append(row))
+        training.train(folder, None, lambda *row: rows.append(row))
     assert (seeds, rows, finished(folder, "train")) == ([6, 7], [], None)
     stops.clear()
-    place = training.train(config, folder, None, lambda *row: rows.append(row))
+    place = training.train(folder, None, lambda *row: rows.append(row))
     assert seeds == [6, 7, 8]  # those of seed 2; a run of seed 1 has 3, 4 and 5
     manifest = load_policy(place).manifest
     said = manifest["candidates"]
@@ -110,7 +110,7 @@ def test_the_best_is_shipped_and_says_so_and_a_stopped_choice_goes_on(tmp_path, 
     assert rows[0][0] == 64
     assert rows[0][1]["train/success_rate"] == 0.5
     assert math.isnan(rows[0][1]["perf/trial_restarts"])
-    training.train(config, folder, None, rows.append)
+    training.train(folder, None, rows.append)
     assert (len(seeds), len(rows)) == (3, 1)  # what is finished stays
 
 

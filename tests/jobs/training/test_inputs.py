@@ -52,7 +52,7 @@ def test_a_run_keeps_a_copy_of_the_policy_that_it_begins_from(tmp_path, name):
     config, tracker = begun(tmp_path, name), Tracker()
     check_inputs(config)
     folder, source = open_run(config), tmp_path / "before" / "policy"
-    found = prepare_inputs(config, folder, tracker)
+    found = prepare_inputs(folder, tracker)
     assert found == (folder.init / "encoder.safetensors" if name == "bytestream" else None)
     expected = load_policy(source).manifest["sha256"]["networks.safetensors"]
     assert tracker.told == {"init": source, "init_sha256": expected, "init_run": "that of before"}
@@ -62,7 +62,7 @@ def test_a_run_keeps_a_copy_of_the_policy_that_it_begins_from(tmp_path, name):
     shutil.rmtree(source.parent)
     check_inputs(config)
     again = Tracker()
-    assert prepare_inputs(config, folder, again) == found
+    assert prepare_inputs(folder, again) == found
     assert again.told == {}
     networks = load_policy(folder.init).networks.state_dict()
     ppo = build_algorithm(config, found, folder.init / "networks.safetensors")
@@ -76,7 +76,7 @@ def test_a_run_keeps_a_copy_of_the_policy_that_it_begins_from(tmp_path, name):
 def test_a_shipped_policy_can_be_trained_on(tmp_path):
     config = make_config(f"runs_dir={tmp_path}", "train.init=models/pretrained/bytestream-s0")
     check_inputs(config)
-    path = prepare_inputs(config, locate_run(config), Tracker())
+    path = prepare_inputs(locate_run(config), Tracker())
     module = build_algorithm(config, path, path.parent / "networks.safetensors").rl_module_spec.build()
     expected = load_policy("models/pretrained/bytestream-s0").networks
     assert torch.equal(module.pi[0].weight, expected["pi"][0].weight)

@@ -201,7 +201,7 @@ def test_a_collapse_is_said_logged_and_written_down_and_training_goes_on(tmp_pat
         pretrain=dataclasses.replace(config.pretrain, iterations=80, validate_every=40, beta=weight),
     )
     folder, listener = open_run(config), Listener()
-    file = prepare_encoder(config, folder, listener)
+    file = prepare_encoder(folder, listener)
     figures = [figures for step, figures in listener.logged.items() if step > 0]
     assert sorted(listener.logged) == [0, 40, 80]
     assert figures[-1]["evae/collapsed"] == dead
@@ -225,7 +225,7 @@ def test_a_refresh_begins_with_the_weights_of_the_encoder_that_is_named(tmp_path
     save_encoder(run_folder / "encoder" / "encoder.safetensors", evae, {})
     for named in (run_folder, run_folder / "encoder" / "encoder.safetensors"):
         config = refreshing(tmp_path, str(named))
-        file = prepare_encoder(config, open_run(config), Listener())
+        file = prepare_encoder(open_run(config), Listener())
         for name, value in load_encoder(file)[0].named_parameters():
             torch.testing.assert_close(value, evae.state_dict()[name], atol=1e-6, rtol=0)
     (run_folder / "encoder" / "encoder.json").unlink()
@@ -236,13 +236,12 @@ def test_a_refresh_whose_checkpoints_are_all_damaged_begins_with_the_named_encod
     torch.manual_seed(7)
     evae, run_folder = EventVAE(context=64, latent=32, target="occupancy"), tmp_path / "before"
     save_encoder(run_folder / "encoder" / "encoder.safetensors", evae, {})
-    config = refreshing(tmp_path, str(run_folder))
-    folder = open_run(config)
-    prepare_encoder(config, folder, Listener())
+    folder = open_run(refreshing(tmp_path, str(run_folder)))
+    prepare_encoder(folder, Listener())
     (folder.path / "stages" / "pretrain.json").unlink()
     for checkpoint in checkpoints(folder.encoder):
         checkpoint.write_bytes(b"damaged")
-    file = prepare_encoder(config, folder, Listener())
+    file = prepare_encoder(folder, Listener())
     for name, value in load_encoder(file)[0].named_parameters():
         torch.testing.assert_close(value, evae.state_dict()[name], atol=1e-6, rtol=0)
 
@@ -255,7 +254,7 @@ def test_windows_of_so_many_events_need_a_recording_with_some(tmp_path):
         pretrain=dataclasses.replace(config.pretrain, windows="count"),
     )
     with pytest.raises(ConfigError, match=r"pretrain\.windows: count needs events, and none were recorded"):
-        prepare_encoder(config, open_run(config), Listener())
+        prepare_encoder(open_run(config), Listener())
 
 
 def test_an_encoder_that_is_not_there_or_of_another_model_is_refused_before_anything_is_made(tmp_path):
@@ -282,7 +281,7 @@ def test_a_policy_without_an_event_vae_has_nothing_to_pretrain(tmp_path):
     ):
         run(config)
     assert not (tmp_path / "runs").exists()  # refused before anything was made
-    assert prepare_encoder(config, open_run(config), None) is None
+    assert prepare_encoder(open_run(config), None) is None
 
 
 def test_an_encoder_that_denoises_decodes_the_events_before_the_faults():

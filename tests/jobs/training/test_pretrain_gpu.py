@@ -103,7 +103,7 @@ def test_pretraining_is_where_the_configuration_says(tmp_path, monkeypatch):
     monkeypatch.setattr(pretrain, "read_split", lambda *told: (None, None))
     for config in (on_gpu(tmp_path / "a"), small_config(tmp_path / "b")):
         with pytest.raises(StopIteration):
-            pretrain.pretrain(config, open_run(config), None)
+            pretrain.pretrain(open_run(config), None)
     assert asked == ["cuda", "cpu"]
 
 

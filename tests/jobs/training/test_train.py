@@ -110,22 +110,20 @@ def test_a_results_file_cut_by_a_kill_counts_its_whole_lines(tmp_path):
 
 
 def test_half_a_line_left_by_a_kill_is_not_written_on_to(tmp_path):
-    config = make_config(f"runs_dir={tmp_path}")
-    folder = open_run(config)
+    folder = open_run(make_config(f"runs_dir={tmp_path}"))
     file = folder.train / "results.jsonl"
     file.parent.mkdir(parents=True)
     file.write_text('{"env_steps": 64, "train/entropy": 0.5}\n{"env_st')
-    with training._listening(config, folder, lambda step, metrics: None) as last:
+    with training._listening(folder, lambda step, metrics: None) as last:
         assert last == {"train/entropy": 0.5}
         training._listeners[-1]({**result(), "num_env_steps_sampled_lifetime": 128})
     assert [json.loads(line)["env_steps"] for line in file.read_text().splitlines()] == [64, 128]
 
 
 def test_a_step_is_reported_once_even_after_a_restart(tmp_path):
-    config = make_config(f"runs_dir={tmp_path}")
-    folder, seen = open_run(config), []
+    folder, seen = open_run(make_config(f"runs_dir={tmp_path}")), []
     for steps in ((64, 128), (128, 192)):
-        with training._listening(config, folder, lambda step, metrics: seen.append(step)) as last:
+        with training._listening(folder, lambda step, metrics: seen.append(step)) as last:
             for step in steps:
                 training._listeners[-1]({**result(), "num_env_steps_sampled_lifetime": step})
     assert seen == [64, 128, 192]
@@ -142,8 +140,8 @@ from pathlib import Path
 from jobs.run.folder import open_run
 from jobs.training.train import train
 from tests.support.configs import TINY, make_config
-config = make_config(*TINY, f"runs_dir={sys.argv[1]}")
-train(config, open_run(config), Path(sys.argv[2]), lambda step, metrics: None)
+folder = open_run(make_config(*TINY, f"runs_dir={sys.argv[1]}"))
+train(folder, Path(sys.argv[2]), lambda step, metrics: None)
 """
 
 
