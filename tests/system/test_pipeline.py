@@ -66,6 +66,8 @@ FEW_STEPS = (
     "env.time_limit_s=1.0",
 )
 
+FEW_FITS = "algo.minibatch_size=64", "algo.imitation.fit_steps=2", "algo.imitation.final_steps=2"
+
 
 @pytest.mark.parametrize(("exp", "words"), [("event_columns", FEW_STEPS), ("event_image", ()), ("rgb", ())])
 @pytest.mark.slow  # that of a plug-in, of tests/system/test_plugins.py, goes through the same stages
@@ -87,6 +89,29 @@ def test_a_policy_without_an_event_vae_trains_and_evaluates_at_once(tmp_path, ex
     assert (stored.info.status, stored.data.tags["policy"]) == ("FINISHED", policy.manifest["name"])
     assert stored.info.run_name == run.name
     assert all(any(name.startswith(section) for name in stored.data.metrics) for section in SECTIONS[1:])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("algo", ["ppo_fast", "imitation"])
+def test_an_encoder_of_what_only_a_simulator_knows_goes_through_every_stage(tmp_path, algo):
+    own = (
+        f"algo={algo}",
+        "model.target=proximity",
+        "model.octaves=2",
+        *(FEW_FITS if algo == "imitation" else ()),
+    )
+    launch(tmp_path, "+exp=bytestream", *own, *SMALLER, *FEW_STEPS)
+    (run,) = (tmp_path / "runs").iterdir()
+    assert {path.stem for path in (run / "stages").iterdir()} == {"collect", "pretrain", "train", "evaluate"}
+    policy = load_policy(run / "policy")
+    assert (policy.spec.evae.target, policy.spec.evae.octaves) == ("proximity", 2)
+
+
+@pytest.mark.slow
+def test_a_recurrent_policy_is_taught_through_every_stage(tmp_path):
+    launch(tmp_path, "+exp=event_columns_gru", "algo=imitation", *FEW_FITS, *FEW_STEPS)
+    (run,) = (tmp_path / "runs").iterdir()
+    assert load_policy(run / "policy").spec.model.name == "event_columns_gru"
 
 
 @pytest.mark.slow
