@@ -72,8 +72,8 @@ def collect(folder: Run, tracker: Tracker) -> dict[str, float]:
             made = [no_episodes(config.env)] * (1 + denoise)
             if own:
                 by_policy = policy, config.collect.policy_share
-                kept = config.collect.conditions, denoise, SECTORS * knows_truth(config)
-                made = record(own, config.seed, advance, *by_policy, *kept)
+                drawn, sectors = config.collect.conditions, SECTORS * knows_truth(config)
+                made = record(own, config.seed, advance, *by_policy, drawn, denoise, sectors)
             if recorded:
                 taken = list(zip([part[split] for part in recorded], shares[len(scenes) :], strict=True))
                 made = [with_recorded(one, taken) for one in made]
