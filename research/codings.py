@@ -39,7 +39,7 @@ from jobs.measure.trade_encoder import DENSE_EVENTS, HEADINGS, MAX_EVENTS, contr
 from jobs.run.folder import Run, finish, open_run
 from jobs.run.progress import progress
 from jobs.tracking.tracker import Tracker, open_tracker
-from jobs.training.collect import data_file, record
+from jobs.training.collect import check_pictures, data_file, record
 from jobs.training.pretrain import encoder_file, held_out_windows, prepare_encoder
 from models.encoder.embedding import CODINGS, temporal_embedding
 from models.encoder.evae import EventVAE, event_targets, pictures, reconstruct
@@ -71,6 +71,7 @@ class Settings:
 
 def run(config: Config) -> dict[str, float]:
     """Train the encoder of the run if there is none yet, then compare codings; return the metrics."""
+    check_pictures(config)
     folder = open_run(config)
     with open_tracker(folder.config, folder) as tracker:
         prepare_encoder(folder, tracker)

@@ -92,8 +92,8 @@ def passable_among(scene: Scene, radius_m: float, height_m: float, speed_mps: fl
     vehicle = radius_m, height_m, speed_mps
     plan = cost_to_go(scene, radius_m, height_m).among(scene.moving, (0.0, 0.0), vehicle)
     first, last = ((x_m - plan.first_x_m) / LATTICE_M for x_m in scene.spawn_range_m)
-    starts = plan.costs[0, max(0, math.floor(first)) : math.ceil(last) + 1]
-    return bool((starts < BLOCKED).all())
+    costs = _costs(np.where(plan.prices >= BLOCKED, BLOCKED, 0.0))  # long ways among others cost much, too
+    return bool((costs[0, max(0, math.floor(first)) : math.ceil(last) + 1] < BLOCKED).all())
 
 
 def lattice_prices(

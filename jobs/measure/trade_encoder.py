@@ -28,7 +28,7 @@ from jobs.measure.plots import plot_encoding_costs
 from jobs.run.folder import Run, finish, locate_run, open_run
 from jobs.run.progress import progress
 from jobs.tracking.tracker import Tracker, open_tracker
-from jobs.training.collect import data_file
+from jobs.training.collect import check_pictures, data_file
 from jobs.training.pretrain import (
     Window,
     check_sources,
@@ -70,6 +70,7 @@ def run(config: Config) -> dict[str, float]:
         )
     if isinstance(model, EncoderModel) and model.coding == "eventnet":
         raise ConfigError("model.coding: must be additive or none for this study, got 'eventnet'")
+    check_pictures(config)
     check_sources(config)
     folder = open_run(config)
     with open_tracker(folder.config, folder) as tracker:

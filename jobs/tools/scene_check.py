@@ -4,6 +4,7 @@ Run: evade scene check FILE.csv
 Expect: seconds; a line for each height, for a point, as the DodgeDrone challenge has it, and for our vehicle.
 """
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -13,8 +14,9 @@ from pydantic.dataclasses import dataclass
 
 from envs.config import STRICT, Positive
 from envs.scene import Scene, make_scene
+from envs.scene.layouts import SphereLayout
 from envs.scene.planning import passable_among
-from envs.scene.spheres import about
+from envs.scene.spheres import about, moving_spheres
 from jobs.analysis.tables import show_table
 from jobs.config.config import Config, ConfigError
 from jobs.config.schema import Name
@@ -44,10 +46,11 @@ def run(config: Config) -> dict[str, float]:
     """
     own = config.own
     try:
-        given = {"length_m": own.length_m, "moving": Path(own.file).with_name(MOVING).is_file()}
-        scene = make_scene(own.file, np.random.default_rng(0), passable=False, **given)
+        scene = make_scene(own.file, np.random.default_rng(0), passable=False, length_m=own.length_m)
     except ValueError as error:
         raise ConfigError(f"scene_check.file: {error}") from None
+    if Path(own.file).with_name(MOVING).is_file():
+        scene = with_moving(scene)
     found = about(scene.obstacles)
     rows = [line(scene, height_m, own.speed_mps) for height_m in own.heights_m]
     show_table(Path(own.file).name, HEAD + AMONG * bool(scene.moving), rows, 1, None)
@@ -59,6 +62,15 @@ def run(config: Config) -> dict[str, float]:
         said = f"{len(scene.moving)} spheres of {MOVING} move, and are passed at {own.speed_mps:g} m/s"
         console.print(f"{said}; +env.layout.moving=true flies among them")
     return {"passable": float(sum(row[3] == "yes" for row in rows)), "overlaps": float(found.overlaps)}
+
+
+def with_moving(scene: Scene) -> Scene:
+    """Return the scene of a file with the spheres that move beside it, if these can be read."""
+    try:
+        return replace(scene, moving=moving_spheres(SphereLayout(file=scene.name, moving=True)))
+    except ValueError as error:
+        console.print(f"What moves is left out: {error}")
+        return scene
 
 
 def line(scene: Scene, height_m: float, speed_mps: float) -> tuple[str, ...]:

@@ -20,6 +20,8 @@ from envs.config import WITHOUT_EVENTS, EnvConfig, Observation, Split, sensor_se
 from envs.corridor import CorridorEnv, Info
 from envs.events import EVENT
 from envs.recordings import Recording, write_recording
+from envs.scene import Scene
+from envs.scene.paths import bodies_at
 from envs.scene.range_scan import sector_proximity
 from jobs.config.conditions import episode_draw
 from jobs.config.config import Config, ConfigError
@@ -68,7 +70,7 @@ def collect(folder: Run, tracker: Tracker) -> dict[str, float]:
                 (dataclasses.replace(config.env, scene=scene, split=split, observation="events"), share)
                 for scene, share in zip(scenes, shares, strict=False)
             ]
-            denoise = config.pretrain.denoise
+            denoise = learns_to_denoise(config)
             made = [no_episodes(config.env)] * (1 + denoise)
             if own:
                 by_policy = policy, config.collect.policy_share
@@ -118,6 +120,22 @@ def check_collect(folder: Run) -> tuple[Path | None, list[dict[str, Recorded]]]:
 def knows_truth(config: Config) -> bool:
     """Whether the encoder of an experiment learns from what only the simulator knows."""
     return getattr(config.model, "target", None) == "proximity"
+
+
+def check_pictures(config: Config) -> None:
+    """Check that the encoder of a run decodes pictures of events, for studies that compare these.
+
+    Raises:
+        ConfigError: It decodes what only the simulator knows.
+    """
+    if knows_truth(locate_run(config).config):
+        rule = "must be a picture of events for this study: occupancy, signed, aged or counts"
+        raise ConfigError(f"model.target: {rule}, got 'proximity'")
+
+
+def learns_to_denoise(config: Config) -> bool:
+    """Whether the encoder decodes events as they were before the faults; proximity has none."""
+    return config.pretrain.denoise and not knows_truth(config)
 
 
 def check_policy(folder: Run) -> Path | None:
@@ -308,9 +326,18 @@ def run_episode(
         true_events.append(env.true_events)
         ends_us.append(end_us)
         if sectors:
-            scan = sector_proximity(env.scene, env.camera_pose(), env.config.camera.fov_deg, sectors)
+            scene = at_rest(env.scene, bodies_at(env.moving, 1e-6 * end_us))
+            scan = sector_proximity(scene, env.camera_pose(), env.config.camera.fov_deg, sectors)
             near.append(np.rint(PROXIMITY_ONE * scan).astype(np.uint16))
     return events, true_events, ends_us, near
+
+
+def at_rest(scene: Scene, bodies: np.ndarray) -> Scene:
+    """Return a scene in which bodies OBSTACLE (N,) stand instead of what moves."""
+    if not len(bodies):
+        return scene
+    standing = np.concatenate([scene.obstacles, bodies])
+    return dataclasses.replace(scene, obstacles=standing, moving=(), throws=None)
 
 
 def steps_of(

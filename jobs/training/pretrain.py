@@ -28,7 +28,7 @@ from jobs.run.folder import Run, finish, finished, locate_run, open_run
 from jobs.run.progress import console, progress
 from jobs.run.torch_threads import torch_threads
 from jobs.tracking.tracker import Tracker, open_tracker
-from jobs.training.collect import PROXIMITY_ONE, check_collect, collect, data_file
+from jobs.training.collect import PROXIMITY_ONE, check_collect, collect, data_file, learns_to_denoise
 from jobs.training.ppo.gpu_steps import exact
 from models.encoder.evae import (
     EventVAE,
@@ -137,7 +137,7 @@ def pretrain(folder: Run, tracker: Tracker) -> dict[str, float]:
     config, settings = folder.config, folder.config.pretrain
     check_data(folder)
     (train, true), (validation, validation_true) = (
-        read_split(folder, split, settings.denoise) for split in SPLITS
+        read_split(folder, split, learns_to_denoise(config)) for split in SPLITS
     )
     seed, device = (config.seed, 2), config.cluster.device
     training = EvaeTraining(evae_settings(config), train, settings, seed, true, device)
@@ -324,7 +324,7 @@ def decoded(
     true: Recording | None,
     most_events: int,
 ) -> Tensor:
-    """Return what a model is to decode from windows, float32 (B, outputs), as `event_targets` has it.
+    """Return what a model is to decode from windows, float32 (B, outputs): recorded, or of `event_targets`.
 
     Args:
         target: Of the model. "proximity" is that at the end of the control step nearest to a window's end.

@@ -226,7 +226,7 @@ def train_step(
         evae: Model in train mode.
         optimizer: Over its parameters.
         batch: Windows, at least two events together.
-        targets: From `event_targets`, on the model's device.
+        targets: As of `event_targets`, on the model's device.
         beta: KL weight on the scale of this module's loss.
         rng: Draws the noise of the latent.
         max_norm: The gradient's norm is clipped to this.
@@ -259,7 +259,7 @@ def validate(evae: EventVAE, batch: EventBatch, targets: Tensor) -> dict[str, fl
         mean picture), explained_loss (1 - reconstruction / mean_picture: 0 for a model that has learnt
         nothing of the single window, 1 for a perfect one, and 0 where all targets are the same;
         of "aged" none reaches 1: the cross entropy keeps the entropy of times between 0 and 1),
-        auc (`ranking_area` of "the target is not 0", or of `NEAR`, by the picture's magnitude), kl (mean over
+        auc (`ranking_area` of "the target is not 0", or is above `NEAR`, by its magnitude), kl (mean over
         windows [nats]), active_units.
     """
     logits, mu, logvar = evae(batch)

@@ -27,6 +27,7 @@ from jobs.config.schema import Count
 from jobs.run.folder import Run, finish, locate_run, open_run
 from jobs.run.progress import progress
 from jobs.tracking.tracker import open_tracker
+from jobs.training.collect import knows_truth
 from jobs.training.pretrain import encoder_file, prepare_encoder
 from models.encoder.evae import EventVAE
 from models.encoder.weights import load_encoder
@@ -108,6 +109,9 @@ def run(config: Config) -> dict[str, float]:
         raise ConfigError(
             f"model: {name} has no event VAE to probe; choose bytestream, bytestream_xy or event_image_vae"
         )
+    if "proximity" in config.own.targets and not knows_truth(locate_run(config).config):
+        rule = "must not hold proximity unless model.target=proximity, which records it"
+        raise ConfigError(f"probe.targets: {rule}, got {config.own.targets}")
     folder = open_run(config)
     config = folder.config
     with open_tracker(config, folder) as tracker:

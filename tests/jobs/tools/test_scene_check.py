@@ -30,6 +30,14 @@ def test_it_says_what_can_be_passed_what_is_not_drawn_as_it_is_and_what_is_left_
     assert last[3:5] + last[7:9] == ["yes", "yes", "no", "no"]  # the ball fills the lane
 
 
+def test_spheres_that_cannot_be_read_are_left_out(tmp_path, capsys):
+    file = tmp_path / "world.csv"
+    file.write_text(LEFT)
+    (tmp_path / "dynamic_obstacles.yaml").write_text("Object1: {csvtraj: none, scale: [1.0, 1.0, 1.0]}\n")
+    assert scene_check.run(configured(file, heights_m=[9.0]))["passable"] == 1.0
+    assert "What moves is left out: scene" in capsys.readouterr().out
+
+
 def test_a_file_that_cannot_be_drawn_is_refused_by_the_key(tmp_path):
     file = tmp_path / "world.csv"
     file.write_text(LEFT.replace("13.0\n", "12.0\n"))

@@ -1,4 +1,5 @@
 import dataclasses
+import importlib
 
 import numpy as np
 import pytest
@@ -7,8 +8,11 @@ from envs.config import EnvConfig, FaultsConfig
 from envs.corridor import CorridorEnv
 from envs.events import EVENT
 from envs.recordings import read_recording
+from envs.scene import ELLIPSOID, OBSTACLE, Scene, at_velocity
+from envs.scene.paths import bodies_at
 from envs.scene.range_scan import sector_proximity
 from jobs.config.config import ConfigError, parse
+from jobs.config.registry import JOBS
 from jobs.rollout.agents import PolicyAgent
 from jobs.run.folder import finish, locate_run, open_run
 from jobs.training import collect
@@ -117,6 +121,33 @@ def test_the_proximity_at_the_end_of_each_step_is_kept_if_asked(recording, monke
     assert kept.max() > 0.5
     assert made.events.tobytes() == recording.events.tobytes()
     assert "step_proximity" not in recording.index
+
+
+def test_what_moves_is_near_where_it_is_at_the_end_of_a_step():
+    ball = np.array([(ELLIPSOID, -40.0, 20.0, 2.0, 1.0, 1.0, 1.0, 0.5)], OBSTACLE)[0]
+    scene = Scene("lane", np.zeros(0, OBSTACLE), moving=(at_velocity(ball, (20.0, 0.0, 0.0)),))
+    for t_s, sector in ((1.0, 0), (2.0, 1), (3.0, 2)):  # at x = -20, 0 and 20 m, 20 m ahead
+        seen = collect.at_rest(scene, bodies_at(scene.moving, t_s))
+        near = sector_proximity(seen, (0.0, 0.0, 2.0, 0.0), 100.0, 3)
+        assert near.argmax() == sector
+        assert near.max() > 0.05
+        assert np.count_nonzero(near) == 1
+    assert collect.at_rest(scene, np.empty(0, OBSTACLE)) is scene
+
+
+@pytest.mark.parametrize(
+    ("exp", "words", "key"),
+    [
+        ("trade_encoder", ["model.target=proximity"], "model.target: must be a picture"),
+        ("codings", ["model.target=proximity"], "model.target: must be a picture"),
+        ("probe", ["probe.targets=[proximity]"], "probe.targets: must not hold proximity"),
+    ],
+)
+def test_studies_refuse_what_they_cannot_decode_before_anything_is_made(tmp_path, exp, words, key):
+    config = parse(compose(f"+exp={exp}", *words, f"runs_dir={tmp_path}"))
+    with pytest.raises(ConfigError, match=key):
+        importlib.import_module(JOBS[config.job].module).run(config)
+    assert not list(tmp_path.iterdir())
 
 
 def test_recordings_of_real_cameras_cannot_be_decoded_into_what_only_a_simulator_knows(tmp_path):

@@ -7,6 +7,7 @@ from ray.rllib.algorithms.ppo.torch.ppo_torch_learner import PPOTorchLearner
 from ray.rllib.core.columns import Columns
 from ray.rllib.env.utils.infinite_lookback_buffer import InfiniteLookbackBuffer
 
+from jobs.config.config import ConfigError
 from jobs.training.algorithms import build_algorithm
 from jobs.training.imitation.env_runner import TaughtEnvRunner
 from jobs.training.imitation.labelled_steps import windows
@@ -177,6 +178,13 @@ def test_a_recurrent_policy_learns_what_a_teacher_says():
     assert float(learner._loss(module, rows)[0].detach()) < 0.8 * before
     assert learner._steps.seen == 2 * len(rows[TAKEN])
     runner.stop()
+
+
+def test_pieces_too_short_to_lead_to_a_state_are_refused():
+    words = "model=event_columns_gru", "algo=imitation", "algo.train_batch_size_per_learner=1024"
+    with pytest.raises(ConfigError, match=r"^algo\.train_batch_size_per_learner: must be 64 .* got 32"):
+        build_algorithm(make_config(*words))
+    build_algorithm(make_config(*words, "algo.num_envs_per_env_runner=8"))
 
 
 def taught(*words):
