@@ -31,9 +31,7 @@ from models.kinds import EvaeSettings, checked
 
 CELLS = 8  # each way, of the target "counts"
 SECTORS = 24  # of the field of view, from left to right, of the target "proximity"
-NEAR = {
-    "proximity": 0.22
-}  # from where on a value counts as present; others: above 0. 0.22 is an obstacle at 15 m
+NEAR = {"proximity": 0.22}  # above it something is there, at 15 m; of other targets above 0
 COUNTED_BITS = 12.0  # log2(1 + count) of a cell is divided by it: 1 at 4,095 events
 LOGVAR_LIMIT = 10.0  # above it exp is continued linearly: exp(89) overflows float32
 ACTIVE_VARIANCE = 0.01  # a latent unit is active if its mean varies more over windows (Burda et al. 2016)

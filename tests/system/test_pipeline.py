@@ -109,8 +109,7 @@ def test_an_encoder_of_what_only_a_simulator_knows_goes_through_every_stage(tmp_
 
 @pytest.mark.slow
 def test_a_recurrent_policy_is_taught_through_every_stage(tmp_path):
-    few = *FEW_FITS, *FEW_STEPS, "algo.num_envs_per_env_runner=2"
-    launch(tmp_path, "+exp=event_columns_gru", "algo=imitation", *few)
+    launch(tmp_path, "+exp=event_columns_gru", "algo=imitation", *FEW_FITS, *FEW_STEPS)
     (run,) = (tmp_path / "runs").iterdir()
     assert load_policy(run / "policy").spec.model.name == "event_columns_gru"
 

@@ -41,7 +41,17 @@ from models.policy.rllib_module import SEQUENCE, STATE
 
 # Fraction of the newest steps in which the student's likeliest action is the cheapest.
 AGREEMENT_KEY = "agreement"
-BEFORE = 32  # steps that lead a recurrent network to its state before those that it learns from
+
+
+def sequence_steps(config: Any) -> int:
+    """Return how many steps a recurrent network learns from at once, and how many lead to their state.
+
+    At most half of the piece of an episode that a batch holds, whose first steps nothing leads to.
+    """
+    piece = config.train_batch_size_per_learner // (
+        max(1, config.num_env_runners) * config.num_envs_per_env_runner
+    )
+    return max(1, min(SEQUENCE, piece // 2))
 
 
 class ImitationLearner(PlainPPOLearner):
@@ -90,7 +100,8 @@ class ImitationLearner(PlainPPOLearner):
         """Take gradient steps on random rows of all steps so far; return the means of their figures."""
         likeliest, costs = rows[Columns.ACTION_DIST_INPUTS].argmax(1, keepdim=True), rows[COSTS]
         if self._policy.state_size:
-            rows, minibatch_size = windows(rows, BEFORE, SEQUENCE), max(1, minibatch_size // SEQUENCE)
+            length = sequence_steps(self.config)
+            rows, minibatch_size = windows(rows, length, length), max(1, minibatch_size // length)
         self._keep(rows)
         count = self._settings["final_steps" if self._last else "fit_steps"]
         optimizer = self.get_optimizer(DEFAULT_MODULE_ID)

@@ -8,23 +8,16 @@ from ray.rllib.algorithms.ppo import PPOConfig
 
 from envs.vehicles.dynamics import make_dynamics, mirrored_actions
 from jobs.config.algorithms import AlgoConfig
-from jobs.config.config import Config, ConfigError
+from jobs.config.config import Config
 from jobs.training.imitation.env_runner import TaughtEnvRunner
 from jobs.training.imitation.labelled_steps import MIRRORED, SETTINGS
-from jobs.training.imitation.learner import AGREEMENT_KEY, BEFORE, ImitationLearner
-from jobs.training.policy import policy_spec
+from jobs.training.imitation.learner import AGREEMENT_KEY, ImitationLearner
 from jobs.training.ppo.train import PPO, Parts, build_of, shared_settings
-from models.policy.networks import network_of
 
 
 def build(config: Config, encoder_path: str | Path | None = None, init: Path | None = None) -> PPOConfig:
     """Return RLlib's configuration of imitation; arguments and errors as of PPO's `build`."""
-    algo, spec = cast(AlgoConfig, config.algo), policy_spec(config)
-    steps = algo.train_batch_size_per_learner // (max(1, algo.num_env_runners) * algo.num_envs_per_env_runner)
-    if network_of(spec).state(spec) and steps < 2 * BEFORE:
-        rule = f"must be {2 * BEFORE} or more for each environment of a recurrent policy that is taught"
-        remedy = "raise it, or lower algo.num_envs_per_env_runner"
-        raise ConfigError(f"algo.train_batch_size_per_learner: {rule}, got {steps}; {remedy}")
+    algo = cast(AlgoConfig, config.algo)
     parts = Parts(TaughtEnvRunner, ImitationLearner, learner_settings(config), algo.lr)
     return build_of(parts, config, encoder_path, init)
 

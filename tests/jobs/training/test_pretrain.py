@@ -161,7 +161,7 @@ def test_training_learns_the_proximity_of_obstacles_in_corridors_that_it_never_s
     for iteration in range(120):
         training.step(iteration)
     after = held_out_figures(training.evae, held_out)
-    assert before["auc_step"] < 0.6 < 0.7 < after["auc_step"]
+    assert before["auc_step"] < 0.55 < 0.65 < after["auc_step"]
 
 
 def test_training_explains_windows_of_flights_that_it_never_saw(recording):

@@ -7,11 +7,10 @@ from ray.rllib.algorithms.ppo.torch.ppo_torch_learner import PPOTorchLearner
 from ray.rllib.core.columns import Columns
 from ray.rllib.env.utils.infinite_lookback_buffer import InfiniteLookbackBuffer
 
-from jobs.config.config import ConfigError
 from jobs.training.algorithms import build_algorithm
 from jobs.training.imitation.env_runner import TaughtEnvRunner
 from jobs.training.imitation.labelled_steps import windows
-from jobs.training.imitation.learner import BEFORE
+from jobs.training.imitation.learner import sequence_steps
 from jobs.training.ppo.learner import REWARD_SCALE, PlainPPOLearner, _minibatch
 from jobs.training.ppo.losses import FIRST_ROW, STARTS, TAKEN, sequences
 from jobs.training.sampling.env_runner import STATES, PlainEnvRunner
@@ -157,7 +156,7 @@ def test_a_window_at_the_start_of_an_episode_repeats_the_decisions_of_the_env_ru
     rows = learner._rows(episodes)
     module = learner.module["default_policy"].unwrapped()
     module.load_state_dict(runner.module.state_dict(), strict=False)
-    cut = windows(rows, BEFORE, SEQUENCE)
+    cut = windows(rows, SEQUENCE, SEQUENCE)
     state = torch.zeros(len(cut[TAKEN]), module.state_size)
     batch = {Columns.OBS: cut[Columns.OBS], Columns.STATE_IN: {STATE: state}}
     with torch.no_grad():
@@ -171,7 +170,7 @@ def test_a_window_at_the_start_of_an_episode_repeats_the_decisions_of_the_env_ru
 def test_a_recurrent_policy_learns_what_a_teacher_says():
     runner, learner = taught("algo.imitation.fit_steps=150", "algo.lr=3e-3", "algo.mirrored=true")
     episodes = runner.sample(num_timesteps=600)
-    rows = windows(learner._rows(episodes), BEFORE, SEQUENCE)
+    rows = windows(learner._rows(episodes), SEQUENCE, SEQUENCE)
     module = learner.module["default_policy"].unwrapped()
     before = float(learner._loss(module, rows)[0].detach())
     learner.update(episodes=episodes, timesteps={"num_env_steps_sampled_lifetime": 1}, minibatch_size=256)
@@ -180,11 +179,19 @@ def test_a_recurrent_policy_learns_what_a_teacher_says():
     runner.stop()
 
 
-def test_pieces_too_short_to_lead_to_a_state_are_refused():
-    words = "model=event_columns_gru", "algo=imitation", "algo.train_batch_size_per_learner=1024"
-    with pytest.raises(ConfigError, match=r"^algo\.train_batch_size_per_learner: must be 64 .* got 32"):
-        build_algorithm(make_config(*words))
-    build_algorithm(make_config(*words, "algo.num_envs_per_env_runner=8"))
+def test_half_of_a_short_piece_leads_to_the_state_of_the_other_half():
+    small = "algo.train_batch_size_per_learner=64", "algo.minibatch_size=16"  # of two environments
+    runner, learner = taught(*small, "env.time_limit_s=1.0")
+    assert sequence_steps(learner.config) == 16
+    for _ in range(2):  # the second time no piece begins an episode, but where one has ended
+        episodes = runner.sample(num_timesteps=64)
+        cut = windows(learner._rows(episodes), 16, 16)
+    assert cut[TAKEN].shape[1] == 32
+    assert cut[TAKEN].sum() >= 0.4 * sum(map(len, episodes))
+    told = {"num_env_steps_sampled_lifetime": 1}
+    learner.update(episodes=episodes, timesteps=told, minibatch_size=16)
+    assert len(learner._steps) == len(cut[TAKEN])
+    runner.stop()
 
 
 def taught(*words):
