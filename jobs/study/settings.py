@@ -44,7 +44,7 @@ class Settings:
     trials: Count
     axes: dict[AxisName, Axis]
     reference: Name | None
-    seeds: Annotated[list[Annotated[int, Field(ge=0, lt=2**31)]], Field(min_length=2)]
+    seeds: Annotated[list[Annotated[int, Field(ge=0, lt=2**31)]], Field(min_length=1)]
     variants: dict[AxisName, dict[str, Any]]
     published: str | None
     train: bool
