@@ -3,6 +3,7 @@
 A column that was added after a file was written gets its default, so that older files stay readable.
 """
 
+import gzip
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -34,10 +35,11 @@ def as_table(labels: Sequence[str], episodes: Mapping[Any, np.ndarray]) -> pd.Da
 
 
 def write_episodes(path: Path, labels: Sequence[str], episodes: Mapping[Any, np.ndarray]) -> None:
-    """Write all episodes as one table into a CSV file; arguments as in `as_table`."""
+    """Write all episodes as one table into a CSV file, packed for .gz; arguments as in `as_table`."""
     text = io.StringIO()
     as_table(labels, episodes).to_csv(text, index=False, lineterminator="\n")
-    write_atomic(path, text.getvalue())
+    whole = text.getvalue().encode()
+    write_atomic(path, gzip.compress(whole, mtime=0) if path.suffix == ".gz" else whole)
 
 
 def read_table(path: Path) -> pd.DataFrame:

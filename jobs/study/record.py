@@ -16,7 +16,7 @@ from jobs.evaluation.evaluate import VIEW_COLUMNS, film_episode
 from jobs.rollout.diagnostics import mean_drift
 from jobs.rollout.policies import own_sensor_differences
 from jobs.rollout.store import EpisodeStore, TaskResult
-from jobs.rollout.table import LABELS, write_episodes
+from jobs.rollout.table import LABELS
 from jobs.rollout.tasks import EvaluationTask, text_of
 from jobs.run.checkpoints import sha256
 from jobs.run.files import write_atomic, write_json
@@ -27,7 +27,7 @@ from jobs.study.axis_figure import axis_figure
 from jobs.study.computed import Study, compute
 from jobs.study.page import FOUND_MET, figures, part
 from jobs.study.plan import Plan
-from jobs.study.results import Condition, Results
+from jobs.study.results import Condition, Results, write_cells
 from jobs.study.summaries import (
     Summary,
     axis_curves,
@@ -105,12 +105,7 @@ def record(
         found: What was evaluated.
         times: Variant -> mean minutes of its trainings; empty: none was trained.
     """
-    episodes = {
-        (at[0], text_of(at[1]), group, "" if seed is None else seed): rows
-        for (at, group), trainings in found.cells.items()
-        for seed, rows in trainings.items()
-    }
-    write_episodes(place / "episodes.csv", LABELS, episodes)
+    write_cells(place / "episodes.csv", found.cells)
     tracker.artifact(place / "episodes.csv", "sweep")
     facts = facts_of(folder, found)
     results = Results(json.loads(json.dumps(facts)), found.cells)

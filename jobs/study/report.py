@@ -14,8 +14,10 @@ from typing import Any
 
 from matplotlib.figure import Figure
 from PIL import Image
+from pydantic.dataclasses import dataclass
 
 from core.files import replaced
+from envs.config import STRICT
 from jobs.analysis.tables import save_plot
 from jobs.config.config import Config, ConfigError
 from jobs.run.files import RunError, read_json, write_atomic
@@ -23,12 +25,22 @@ from jobs.run.progress import console
 from jobs.study.computed import Study, compute, published
 from jobs.study.doses import measure_doses, read_doses, write_doses
 from jobs.study.page import figures, fill, marked, new_page, part
-from jobs.study.results import FOLDERS, check_whole, publish, read_results
+from jobs.study.results import FOLDERS, check_whole, joined, publish, read_published, read_results
 from jobs.study.spec import read_study
 from jobs.study.tables import write_changes, write_estimates, write_tests
 from jobs.tools.replay_page import PAGE
 
 DOCS = Path("docs")
+
+
+@dataclass(frozen=True, config=STRICT)
+class Settings:
+    """Whether trainings of a study that docs/data has stay beside those of the run.
+
+    So a study can be trained on several days or machines, seed by seed: the runs must evaluate alike.
+    """
+
+    keep: bool
 
 
 def run(config: Config) -> dict[str, Any]:
@@ -87,15 +99,16 @@ def write_study(name: str, folder: Path, config: Config, docs: Path) -> Path:
         ConfigError: It is not complete, or of an earlier version.
         RunError: A file of it is damaged.
     """
-    said, results = read_study(name), read_results(folder)
+    said, results, data, doses = read_study(name), read_results(folder), docs / "data", []
+    if config.own.keep:
+        results = joined(read_published(data, name), results)
     check_whole(results)
-    data, doses = docs / "data", []
     if said.get("doses"):
         env = dataclasses.replace(config.env, scene=results.facts["scene"], split="eval")
         doses = measure_doses(said, results, env)
     study = compute(name, said, results, doses, data)
     drawn = figures(study)  # before anything is replaced: data, figures and pages must stay in step
-    publish(folder, data, name, results)
+    publish(data, name, results)
     if doses:
         write_doses(data / f"{name}_doses.csv", doses)
         study = study._replace(doses=read_doses(data / f"{name}_doses.csv"))

@@ -1,6 +1,5 @@
 """Results of a study: what made it, and its episodes by condition, group and training."""
 
-import gzip
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,10 +13,10 @@ from jobs.analysis.tables import write_csv
 from jobs.config.conditions import NOMINAL
 from jobs.config.errors import ConfigError
 from jobs.rollout.episodes import EPISODE
-from jobs.rollout.table import LABELS, read_table
+from jobs.rollout.table import LABELS, read_table, write_episodes
 from jobs.rollout.tasks import text_of
 from jobs.run.checkpoints import sha256
-from jobs.run.files import RunError, read_json, write_atomic, write_json
+from jobs.run.files import RunError, read_json, write_json
 
 Value = float | str
 Condition = tuple[str, Value]  # an axis, and its value as a number or a word
@@ -25,6 +24,9 @@ Trainings = Mapping[int | None, np.ndarray]  # training seed -> EPISODE of the s
 Cells = Mapping[tuple[Condition, str], Trainings]  # by condition and group
 FOLDERS = ("study", "sweep", "ablation")  # in a run folder; the last two are of earlier versions
 RATE = (0.0, 1.0)  # bounds of a rate
+# Facts of two runs that must agree before they are one study, and those that say what made a run.
+EVALUATION = ("exp", "axes", "scene", "split", "trials", "action", "reference", "budget", "env_steps")
+MADE = ("run", "identity", "command", "commit", "date")
 
 
 @dataclass(frozen=True)
@@ -180,20 +182,69 @@ def read_published(data: Path, name: str) -> Results:
     return Results({"axes": axes, "groups": groups}, cells)
 
 
-def publish(study: Path, data: Path, name: str, results: Results) -> None:
-    """Copy a study from its run folder into the published data.
+def write_cells(file: Path, cells: Cells) -> None:
+    """Write the episodes of a study, plain or packed (.gz)."""
+    rows = {
+        (axis, text_of(value), group, "" if seed is None else seed): own
+        for ((axis, value), group), trainings in cells.items()
+        for seed, own in trainings.items()
+    }
+    write_episodes(file, LABELS, rows)
+
+
+def joined(earlier: Results, more: Results) -> Results:
+    """Return the trainings of two runs of a study as the results of one.
 
     Args:
-        study: The folder in its run folder.
+        earlier: Its facts come first: commands, commits, the order of groups.
+        more: Other trainings in the same corridors under the same conditions.
+
+    Raises:
+        ConfigError: The runs evaluate otherwise, or have a training in common.
+    """
+    one, other = earlier.facts, more.facts
+    differ = [name for name in EVALUATION if one.get(name) != other.get(name)]
+    variants, more_variants = one.get("variants", {}), other.get("variants", {})
+    differ += [name for name in variants if more_variants.get(name, variants[name]) != variants[name]]
+    both = [f"{group} s{seed}" for group, seeds in one["groups"].items() for seed in seeds
+            if seed in other["groups"].get(group, ())]  # fmt: skip
+    if differ or both:
+        what = f"other {', '.join(differ)}" if differ else f"also {', '.join(both)}"
+        raise ConfigError(
+            f"report.keep: must be false unless the run evaluates other trainings as the published ones were "
+            f"evaluated; it has {what}"
+        )
+    named = dict.fromkeys((*one["groups"], *other["groups"]))
+    groups = {name: [*one["groups"].get(name, ()), *other["groups"].get(name, ())] for name in named}
+    facts = {
+        **other,
+        "groups": groups,
+        "met": sorted([*one["met"], *(place_ for place_ in other["met"] if place_ not in one["met"])]),
+        "variants": {**variants, **more_variants},
+        "seeds": sorted({*one.get("seeds", ()), *other.get("seeds", ())}),
+        "evaluated_at": sorted({*one["evaluated_at"], *other["evaluated_at"]}),
+        "exactness": one["exactness"],
+        "earlier": [*one.get("earlier", ()), {name: one[name] for name in MADE}],
+    }
+    cells = {
+        (at, group): {**earlier.trainings(at, group), **more.trainings(at, group)}
+        for group in groups
+        for at in earlier.conditions
+    }
+    return Results(facts, cells)
+
+
+def publish(data: Path, name: str, results: Results) -> None:
+    """Write a study into the published data.
+
+    Args:
         data: Where `NAME_episodes.csv.gz`, `NAME_about.json` and `NAME_trainings.csv` go.
         name: Of the study.
-        results: What the folder holds.
+        results: What it found.
     """
     data.mkdir(parents=True, exist_ok=True)
-    packed = gzip.compress((study / "episodes.csv").read_bytes(), mtime=0)
-    write_atomic(data / f"{name}_episodes.csv.gz", packed)
-    facts = read_json(study / "about.json")
-    facts.pop("host", None)  # means nothing to others
+    write_cells(data / f"{name}_episodes.csv.gz", results.cells)
+    facts = {key: value for key, value in results.facts.items() if key != "host"}  # means nothing to others
     write_json(data / f"{name}_about.json", facts)
     rows = [
         (axis, text_of(value), group, "" if seed is None else seed, len(own),

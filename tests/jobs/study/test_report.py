@@ -9,11 +9,12 @@ import pytest
 from PIL import Image
 
 from jobs.config.config import ConfigError
-from jobs.rollout.table import LABELS
-from jobs.run.files import write_json
+from jobs.rollout.table import LABELS, read_table
+from jobs.run.files import read_json, write_json
 from jobs.study import computed, report
 from jobs.study.page import fill, marked, new_page
 from jobs.study.report import filled_pages, newest_studies, write_study, write_trade
+from jobs.study.results import read_published
 from tests.support.configs import small_config
 from tests.support.sweep_folders import ABOUT, write_ablation, write_sweep
 
@@ -80,6 +81,33 @@ def test_every_episode_and_training_is_there_to_be_analysed_again(sweep, tmp_pat
     assert {f"robustness_{name}.csv" for name in ("estimates", "changes")} <= {
         path.name for path in data.iterdir()
     }
+
+
+def test_more_trainings_come_beside_the_published_ones_if_that_is_asked(tmp_path):
+    docs, config = tmp_path / "docs", config_of(tmp_path)
+    kept = dataclasses.replace(config, own=report.Settings(keep=True))
+    runs = [tmp_path / "runs" / str(number) / "study" for number in range(2)]
+    for number, run in enumerate(runs):
+        write_ablation(run, "training_lengths", lambda group, axis, value, seed: seed % 3)
+        table = read_table(run / "episodes.csv")
+        seeds = sorted(set(table["Training"]))[number::2]
+        table[table["Training"].isin(seeds)].to_csv(run / "episodes.csv", index=False)
+        about = read_json(run / "about.json")
+        about["groups"] = {
+            name: [seed for seed in own if seed in seeds] for name, own in about["groups"].items()
+        }
+        write_json(run / "about.json", {**about, "command": f"command {number}"})
+    write_study("training_lengths", runs[0], config, docs)
+    alone = read_published(docs / "data", "training_lengths")
+    page = write_study("training_lengths", runs[1], kept, docs).read_text()
+    assert "`command 0`" in page
+    assert "`command 1`" in page
+    both = read_published(docs / "data", "training_lengths")
+    assert all(len(both.groups[name]) > len(own) for name, own in alone.groups.items())
+    for at, trainings in alone.cells.items():
+        assert all(np.array_equal(both.cells[at][seed], own) for seed, own in trainings.items())
+    with pytest.raises(ConfigError, match=r"report\.keep"):
+        write_study("training_lengths", runs[1], kept, docs)
 
 
 @pytest.mark.parametrize("exp", ["training_lengths", "encoder_seeds", "camera_rates", "ppo_event_set"])

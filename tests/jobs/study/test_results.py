@@ -16,7 +16,15 @@ from jobs.rollout.table import LABELS, read_table
 from jobs.run.files import RunError, write_json
 from jobs.run.folder import run_name
 from jobs.run.provenance import REPOSITORY
-from jobs.study.results import check_whole, read_cells, read_published, read_results, value_of
+from jobs.study.results import (
+    Results,
+    check_whole,
+    joined,
+    read_cells,
+    read_published,
+    read_results,
+    value_of,
+)
 from tests.support.configs import compose, sweep_config
 from tests.support.episodes import flights
 from tests.support.runs import planned
@@ -116,3 +124,42 @@ def test_a_study_without_what_made_it_has_the_groups_of_its_episodes():
     assert len(results.trained) == 7
     assert results.baselines()["control_hz", 45.0] == results.nominal
     assert isinstance(read_table(DATA / "taught_episodes.csv.gz"), pd.DataFrame)
+
+
+def only(results, seeds):
+    """The trainings of these seeds, as if no others had been evaluated."""
+    groups = {name: [seed for seed in own if seed in seeds] for name, own in results.groups.items()}
+    cells = {
+        at: {seed: own for seed, own in trainings.items() if seed in seeds}
+        for at, trainings in results.cells.items()
+    }
+    return Results({**results.facts, "groups": groups, "seeds": sorted(seeds)}, cells)
+
+
+def test_a_study_that_was_trained_in_two_runs_is_the_study_trained_in_one():
+    whole = read_published(DATA, "encoder_targets")
+    earlier, more = only(whole, {0, 1, 2}), only(whole, {3, 4})
+    both = joined(earlier, more)
+    assert list(both.cells) == list(whole.cells)
+    for at, trainings in whole.cells.items():
+        assert list(both.cells[at]) == list(trainings)
+        assert all(np.array_equal(both.cells[at][seed], own) for seed, own in trainings.items())
+    assert {**both.facts, "earlier": ()} == {**whole.facts, "earlier": ()}
+    assert [one["run"] for one in both.facts["earlier"]] == [whole.facts["run"]]
+
+
+@pytest.mark.parametrize(
+    ("seeds", "changed", "named"),
+    [
+        ({3, 4}, {"trials": 7}, "trials"),
+        ({3, 4}, {"axes": {}}, "axes"),
+        ({3, 4}, {"variants": {"occupancy": {"algo.lr": 1.0}}}, "other occupancy"),
+        ({2, 3}, {}, "s2"),
+    ],
+)
+def test_runs_that_differ_or_share_a_training_are_not_joined(seeds, changed, named):
+    whole = read_published(DATA, "encoder_targets")
+    facts = {**whole.facts, "variants": {"occupancy": {}}}
+    earlier, more = only(Results(facts, whole.cells), {0, 1, 2}), only(whole, seeds)
+    with pytest.raises(ConfigError, match=rf"report\.keep: .*{named}"):
+        joined(earlier, Results({**more.facts, **changed}, more.cells))
