@@ -17,6 +17,7 @@ WIDTH, SIDE, GAP, HEAD, LINE = 1248, 320, 16, 44, 26  # pixels
 MARGIN_M, SIDES_M = 2.0, 14.0  # shown before start and behind goal; beside the way
 TOP = HEAD + LINE + SIDE + LINE + GAP // 2  # of the plan
 SLOWER, MAX_FPS, MIN_FPS = 4, 50, 10
+FRAMES_PER_FLIGHT_S = 100  # at most; more take longer to draw and show no more
 HEADINGS = (("left", 1), ("forward", 0), ("right", 2))  # as a person looks, with their numbers
 TEXT, DIM, WALL, TRAIL, CHOSEN = "#f1f5f9", "#94a3b8", "#64748b", "#38bdf8", "#f59e0b"
 GROUND, OBSTACLE, GOAL = "#15181f", "#cbd5e1", "#34d399"
@@ -48,7 +49,7 @@ def _write(
 
 
 def write_film(path: Path, recorded: RecordedEpisode, title: str, decode: Decode | None) -> Path:
-    """Write an MP4 file with a frame for each step of an episode; return it.
+    """Write an MP4 file of an episode, a frame for each step or for every second, third and so on; return it.
 
     Args:
         path: The file.
@@ -56,14 +57,17 @@ def write_film(path: Path, recorded: RecordedEpisode, title: str, decode: Decode
         title: Whose episode it is.
         decode: Event window -> picture in [-1, 1], float (H, W), of a panel of its own; None: there is none.
     """
-    control_hz = recorded.env.control_hz
-    fps = float(np.clip(round(control_hz / SLOWER), MIN_FPS, MAX_FPS))
-    canvas = _background(recorded, f"{title}   {_pace(control_hz / fps)}")
+    control_hz, last = recorded.env.control_hz, len(recorded.moments) - 1
+    stride = max(1, round(control_hz / FRAMES_PER_FLIGHT_S))
+    fps = float(np.clip(round(control_hz / stride / SLOWER), MIN_FPS, MAX_FPS))
+    canvas = _background(recorded, f"{title}   {_pace(control_hz / stride / fps)}")
     latents = [moment.latent for moment in recorded.moments if moment.latent is not None]
     largest = float(np.abs(latents).max(initial=0.0)) or 1.0
     with open_film(path, control_hz, None, fps) as film:
-        for place in range(len(recorded.moments)):
-            film.add(np.asarray(_frame(canvas, recorded, place, (decode, largest))))
+        before = 0
+        for place in sorted({*range(0, last, stride), last}):
+            film.add(np.asarray(_frame(canvas, recorded, (before, place), (decode, largest))))
+            before = place
     return path
 
 
@@ -116,20 +120,23 @@ def _background(recorded: RecordedEpisode, title: str) -> Image.Image:
 
 
 def _frame(
-    canvas: Image.Image, recorded: RecordedEpisode, place: int, shown: tuple[Decode | None, float]
+    canvas: Image.Image,
+    recorded: RecordedEpisode,
+    places: tuple[int, int],
+    shown: tuple[Decode | None, float],
 ) -> Image.Image:
     """Draw one moment; the way so far stays on the canvas.
 
-    `shown` is what draws the latent's picture, if anything, and the size of a full bar of the latent.
+    `places` are the moment drawn before and this one, `shown` what draws the latent's picture, if anything,
+    and the size of a full bar of the latent.
     """
-    decode, largest = shown
+    (first, place), (decode, largest) = places, shown
     moment, moments = recorded.moments[place], recorded.moments
-    before = moments[max(0, place - 1)]
-    way = _on_plan(recorded, np.array([(before.x_m, before.y_m), (moment.x_m, moment.y_m)]))
+    way = _on_plan(recorded, np.array([(one.x_m, one.y_m) for one in moments[first : place + 1]]))
     ImageDraw.Draw(canvas).line(way, TRAIL, 3)
     picture = canvas.copy()
     draw = ImageDraw.Draw(picture)
-    draw.circle(way[1], 7, CHOSEN, TEXT, 2)
+    draw.circle(way[-1], 7, CHOSEN, TEXT, 2)
     if place == len(moments) - 1:
         _draw_end(picture, recorded)
     facts = f"step {place + 1} of {len(moments)}   {moment.t_us / 1e6:4.2f} s   {moment.y_m:5.1f} m"

@@ -1,8 +1,8 @@
 """Show a policy in one held-out corridor: its result as a line of numbers, and a film.
 
 Run: make demo, or python -m platform.launch +exp=demo demo.policy=bytestream-s1 env.scene=gates seed=3
-Expect: half a minute. The film lies in the run folder under `demo/`, with a frame for each step, and opens
-where there is a display. Nothing is trained, and Ray and MLflow are not started.
+Expect: half a minute. The film lies in the run folder under `demo/`, with up to 100 frames for a second of
+flight, and opens where there is a display. Nothing is trained, and Ray and MLflow are not started.
 """
 
 import dataclasses
