@@ -157,7 +157,8 @@ class Sensor:
 
     def faults(self) -> FaultState:
         """Return the faults that the compiled step applies to the events of this sensor."""
-        return self._real.state if self.sees_by_looks and self._real.is_compiled else NO_FAULTS
+        is_compiled = self.has_faults and self.sees_by_looks and self._real.is_compiled
+        return self._real.state if is_compiled else NO_FAULTS
 
     @property
     def needs_python(self) -> bool:

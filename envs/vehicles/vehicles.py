@@ -131,7 +131,7 @@ class Vehicles:
             self._faults = corridor_list(faults, len(self.rows))
             self._faults_of = [faults] * len(self.rows)
         set_corridor(self._corridors, row, corridor)
-        if faults is not self._faults_of[row]:  # numba takes milliseconds to find the type of a random stream
+        if faults is not self._faults_of[row]:  # numba takes long to find the type of a random stream
             set_corridor(self._faults, row, faults)
             self._faults_of[row] = faults
         self._set_filter(row, config)
