@@ -193,11 +193,14 @@ class RecurrentModel(Model):
 
     Attributes:
         units: Numbers of its state.
+        own_actions, own_velocity: As of `EncoderModel`.
     """
 
     name: KindName
     stack: Stack
     units: Size
+    own_actions: bool = False
+    own_velocity: bool = False
 
 
 class Kind(NamedTuple):

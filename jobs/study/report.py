@@ -25,7 +25,15 @@ from jobs.run.progress import console
 from jobs.study.computed import Study, compute, published
 from jobs.study.doses import measure_doses, read_doses, write_doses
 from jobs.study.page import figures, fill, marked, new_page, part
-from jobs.study.results import FOLDERS, check_whole, joined, publish, read_published, read_results
+from jobs.study.results import (
+    FOLDERS,
+    Results,
+    check_whole,
+    joined,
+    publish,
+    read_published,
+    read_results,
+)
 from jobs.study.spec import read_study
 from jobs.study.tables import write_changes, write_estimates, write_tests
 from jobs.tools.replay_page import PAGE
@@ -99,10 +107,8 @@ def write_study(name: str, folder: Path, config: Config, docs: Path) -> Path:
         ConfigError: It is not complete, or of an earlier version.
         RunError: A file of it is damaged.
     """
-    said, results, data, doses = read_study(name), read_results(folder), docs / "data", []
-    if config.own.keep:
-        results = joined(read_published(data, name), results)
-    check_whole(results)
+    said, data, doses = read_study(name), docs / "data", []
+    results = results_of(name, folder, data if config.own.keep else None)
     if said.get("doses"):
         env = dataclasses.replace(config.env, scene=results.facts["scene"], split="eval")
         doses = measure_doses(said, results, env)
@@ -124,6 +130,23 @@ def write_study(name: str, folder: Path, config: Config, docs: Path) -> Path:
             page, fill(pages[page], lambda at, what: part(study if at == name else study_of(data, at), what))
         )
     return shown[0]
+
+
+def results_of(name: str, folder: Path, data: Path | None) -> Results:
+    """Read what a study has left in its run folder, beside the trainings that `data` has if that is given.
+
+    Raises:
+        ConfigError: It is not complete, or of an earlier version, or the two do not belong together.
+        RunError: A file of it is damaged.
+    """
+    results = read_results(folder)
+    if data is not None:
+        if not (data / f"{name}_episodes.csv.gz").is_file():
+            rule = "must be false for a study that is not published"
+            raise ConfigError(f"report.keep: {rule}, got true for {name}; {data} has no episodes of it")
+        results = joined(read_published(data, name), results)
+    check_whole(results)
+    return results
 
 
 def filled_pages(docs: Path) -> dict[str, str]:

@@ -193,11 +193,13 @@ class PolicyGraph(nn.Module):
         kept = newest + (stack[:-1] - newest) * self._rest(*seen) if len(self.tau_us) else stack[1:]
         pushed = torch.cat([kept, newest])
         stack = torch.where(first, feature[None].expand(self.shape), pushed)
+        own: tuple[Tensor, ...] = ()
         if self.state_size:
             _, after = self.trunk(stack[None, None], torch.where(first, 0.0, state)[None])
-            return self.pi(after)[0], stack, after[0]
-        logits = self.pi(self.read(stack[None]))[0]
-        return (logits, stack, logits.argmax()) if self.own_actions else (logits, stack)
+            logits, own = self.pi(after)[0], (after[0],)
+        else:
+            logits = self.pi(self.read(stack[None]))[0]
+        return logits, stack, *((logits.argmax(), *own) if self.own_actions else own)
 
     def _rest(self, events: Tensor, window_us: Tensor) -> Tensor:
         """Return share (K, 1) of each mean that outlives the step (`models.policy.memory`)."""

@@ -97,6 +97,9 @@ def test_more_trainings_come_beside_the_published_ones_if_that_is_asked(tmp_path
             name: [seed for seed in own if seed in seeds] for name, own in about["groups"].items()
         }
         write_json(run / "about.json", {**about, "command": f"command {number}"})
+    with pytest.raises(ConfigError, match=r"report\.keep: must be false for a study that is not published"):
+        write_study("training_lengths", runs[0], kept, docs)
+    assert not docs.exists()
     write_study("training_lengths", runs[0], config, docs)
     alone = read_published(docs / "data", "training_lengths")
     page = write_study("training_lengths", runs[1], kept, docs).read_text()

@@ -17,7 +17,8 @@ from jobs.training.sampling.env_runner import STATES, PlainEnvRunner
 from models.policy.rllib_module import SEQUENCE, STATE
 from tests.support.configs import SHORT, make_config
 
-GRU = *SHORT, "model=event_columns_gru", "model.units=8"
+OWN = "model.own_actions=true", "model.own_velocity=true"
+GRU = *SHORT, "model=event_columns_gru", "model.units=8", *OWN
 
 
 @pytest.fixture(scope="module")

@@ -113,10 +113,12 @@ def test_own_actions_are_remembered_as_features_are(memory_ms):
     np.testing.assert_array_equal(kept[..., 2 * SIDE :], told)
 
 
-def test_a_policy_sees_the_actions_that_were_taken_from_observations_and_from_events(tmp_path):
-    spec = make_spec("event_columns", memory_ms=TAUS, own_actions=True)
+@pytest.mark.parametrize("name", ["event_columns", "event_columns_gru"])
+def test_a_policy_sees_the_actions_that_were_taken_from_observations_and_from_events(name, tmp_path):
+    spec = make_spec(name, memory_ms=TAUS, own_actions=True)
     networks = build_networks(spec, seed=3)
-    networks["pi"][-1].weight.data.mul_(100.0)
+    *_, last = networks["pi"].modules()
+    last.weight.data.mul_(100.0)
     policy = load_policy(save_policy(tmp_path / "policy", networks, spec, ABOUT))
     windows = make_windows(np.random.default_rng(0), 12, side=SIDE)
 
@@ -159,10 +161,12 @@ def test_velocity_is_remembered_in_units_of_ten_metres_a_second_behind_the_actio
             remember(kept, features, first, spec, 5000, taken, missing)
 
 
-def test_a_policy_reads_the_velocity_that_it_is_told(tmp_path):
-    spec = make_spec("event_columns", own_velocity=True)
+@pytest.mark.parametrize("name", ["event_columns", "event_columns_gru"])
+def test_a_policy_reads_the_velocity_that_it_is_told(name, tmp_path):
+    spec = make_spec(name, own_velocity=True)
     networks = build_networks(spec, seed=3)
-    networks["pi"][-1].weight.data.mul_(100.0)
+    *_, last = networks["pi"].modules()
+    last.weight.data.mul_(100.0)
     policy = load_policy(save_policy(tmp_path / "policy", networks, spec, ABOUT))
     window = make_windows(np.random.default_rng(0), 1, side=SIDE)
     with pytest.raises(ValueError, match="reads the vehicle's velocity"):

@@ -7,11 +7,12 @@ import pytest
 import torch
 from ray.rllib.core.columns import Columns
 
-from models.policy import load_policy
+from models.policy import load_policy, save_policy
+from models.policy.networks import build_networks
 from models.policy.onnx import export_onnx
 from models.policy.recurrent import GatedUnit
 from models.policy.rllib_module import STATE, module_spec
-from tests.support.policies import SIDE, make_spec, make_windows, save
+from tests.support.policies import ABOUT, SIDE, make_spec, make_windows, save
 
 NAME = "event_columns_gru"
 
@@ -103,20 +104,29 @@ def test_rllibs_forward_passes_over_a_sequence_and_over_its_steps_agree(module):
 
 
 @pytest.mark.system
-def test_the_onnx_file_gives_the_logits_of_the_policy_over_episodes(policy, tmp_path):
+@pytest.mark.parametrize("own", [False, True], ids=["events", "events, actions and velocity"])
+def test_the_onnx_file_gives_the_logits_of_the_policy_over_episodes(own, tmp_path):
+    spec = make_spec(NAME, own_actions=own, own_velocity=own)
+    policy = load_policy(save_policy(tmp_path / "policy", build_networks(spec, seed=3), spec, ABOUT))
     file = export_onnx(policy, tmp_path / "policy.onnx")
     session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
     stack, state = np.zeros(policy.stack_shape, np.float32), np.ones(16, np.float32)
-    rng = np.random.default_rng(0)
+    rng, action = np.random.default_rng(0), np.array(0)
     for step in range(8):
         if step in (0, 5):
             policy.reset(1)
+        policy.velocity_mps = rng.uniform(-5.0, 15.0, (1, 2)).astype("f4")
         events = rng.integers(0, SIDE, (20, 4))
         events[:, 0], events[:, 3] = np.sort(rng.integers(1, 5000, 20)), rng.choice([-1, 1], 20)
         named = dict(zip("txyp", events.T, strict=True))
         expected = policy.event_logits(named, 0, 5000)
         first = np.array(step in (0, 5))
-        own = {"last_stack": stack, "first": first, "last_state": state}
         shown = {"events": events.astype(np.int64), "window_us": np.array(5000)}
-        logits, stack, state, _ = session.run(None, {**shown, **own})
+        shown |= {"last_stack": stack, "first": first, "last_state": state}
+        shown |= {"last_action": action, "velocity_mps": policy.velocity_mps[0]} if own else {}
+        logits, stack, *taken, state, _ = session.run(None, shown)
         np.testing.assert_allclose(logits, expected, rtol=1e-4, atol=1e-4)
+        if own:
+            action = np.array(2 - logits.argmax())  # not the likeliest, as if it were drawn
+            policy.taken = np.array([int(action)])
+            assert taken[0] == logits.argmax()
