@@ -15,7 +15,7 @@ from envs.recordings import write_events
 from jobs.config.config import parse
 from jobs.rollout.policies import BASELINES, PRETRAINED, find_study_policies
 from jobs.run.folder import locate_run
-from jobs.study.models import MANIFEST, shipped_groups, success_rates
+from jobs.study.models import MANIFEST, success_rates
 from jobs.study.plan import plan_study
 from models.kinds import KINDS
 from tests.support.configs import compose
@@ -174,24 +174,6 @@ def test_the_readme_counts_the_formats_that_can_be_written(tmp_path):
     formats = re.findall(r"\b(npz|hdf5|txt|csv|aedat4|evt3|evt2|dat)\b", str(error.value))
     words = {8: "eight", 9: "nine", 10: "ten"}
     assert f"Write {words[len(set(formats))]} formats" in text_of("README.md")
-
-
-def test_what_the_gallery_says_of_other_textures_is_what_the_data_say():
-    with gzip.open(DATA / "robustness_episodes.csv.gz", "rt", newline="") as file:
-        rows = [row for row in csv.DictReader(file) if row["Value"] == "texture_change"]
-    trained = {group.name for group in shipped_groups(PRETRAINED)}
-    rows = [row for row in rows if row["Group"] in trained]
-    first = [row for row in rows if row["seed"] == "0"]
-    failed = [row for row in first if row["success"] == "False"]
-    early = [row for row in first if float(row["distance_m"]) < 20]
-    distances = sorted(float(row["distance_m"]) for row in rows)
-    half = (distances[(len(rows) - 1) // 2] + distances[len(rows) // 2]) / 2
-    found = said(
-        r"(\d+) of (\d+) shipped policies fail, (\d+) of them within 20 m. "
-        r"Over all (\d+) corridors half of the episodes end within (\d+) m",
-        "docs/watch.md",
-    )
-    assert found == [len(failed), len(first), len(early), len(rows) // len(first), round(half)]
 
 
 def test_the_page_of_claims_tells_what_is_certain_from_what_an_interval_excludes():
