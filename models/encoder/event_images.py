@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from core.pictures import GREY_OFF, GREY_ON
 from models.encoder.event_batch import EventBatch, Grid, batch_packed, batch_windows
-from models.encoder.products import Linear, orthogonal_
+from models.encoder.products import Linear, orthogonal_, packed
 from models.kinds import MIN_IMAGE
 
 OFF_SHARE = GREY_OFF / GREY_ON
@@ -129,6 +129,7 @@ class PictureEncoder:
         """Take the parts of an `EventVAE` of variant "event_image_vae"."""
         self.grid, self.latent_size = evae.grid, evae.settings.latent
         self.layers = nn.Sequential(evae.ecn.layers, evae.encoder).eval()
+        self._run = packed(self.layers)
 
     def encode(self, events: Any, start_us: int, window_us: int) -> np.ndarray:
         """Return latent mu (latent,) of one window. Raises ValueError as `event_batch.index_events`."""
@@ -141,4 +142,4 @@ class PictureEncoder:
     def encode_batch(self, batch: EventBatch) -> np.ndarray:
         """Return the latents (B, latent) of a batch."""
         with torch.inference_mode():
-            return self.layers(event_pictures(batch))[:, : self.latent_size].numpy()
+            return self._run(event_pictures(batch))[:, : self.latent_size].numpy()

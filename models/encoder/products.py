@@ -285,6 +285,58 @@ class Linear(nn.Linear):
         return affine(inputs, self.weight, self.bias)
 
 
+class PackedLinear(nn.Module):
+    """A `Linear` of float32 by the weights of this moment, for a few rows at a time; the bytes are the same.
+
+    `add_product` packs its second factor in each call, which takes longer than the products of a few rows.
+    """
+
+    def __init__(self, layer: nn.Linear) -> None:
+        """Copy the weights of a layer into panels (P, K, lanes), and its bias."""
+        super().__init__()
+        self._size, inputs = layer.weight.shape
+        lanes = LINE // 4
+        padded = np.zeros((-(-self._size // lanes) * lanes, inputs), np.float32)
+        padded[: self._size] = layer.weight.detach().numpy()
+        self._panels = aligned(padded.size).reshape(-1, inputs, lanes)
+        self._panels[:] = padded.reshape(-1, lanes, inputs).transpose(0, 2, 1)
+        self._bias = np.zeros(len(padded), np.float32)
+        if layer.bias is not None:
+            self._bias[: self._size] = layer.bias.detach().numpy()
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """Return outputs (..., M) of inputs (..., K), without gradients."""
+        rows = inputs.detach().reshape(-1, self._panels.shape[1]).contiguous().numpy()
+        out = aligned(-(-len(rows) // ROWS) * ROWS * len(self._bias)).reshape(-1, len(self._bias))
+        out[:] = self._bias
+        if len(rows):
+            _add_panels(rows, self._panels, out)
+        return torch.from_numpy(out[: len(rows), : self._size]).reshape(*inputs.shape[:-1], self._size)
+
+
+@numba.njit(
+    types.void(types.float32[:, ::1], types.float32[:, :, ::1], types.float32[:, ::1]),
+    cache=True,
+    error_model="numpy",
+    nogil=True,
+)
+def _add_panels(a, panels, out) -> None:  # type: ignore[no-untyped-def]
+    """Add a (M, K) @ b to `out`, which has as many rows or up to ROWS - 1 more; b is packed into panels."""
+    for p in range(len(panels)):
+        for i in range(0, len(out), ROWS):
+            _add_tile(a, i, 0, panels[p], a.shape[1], out, i, p * panels.shape[2], False)
+
+
+def packed(network: nn.Module) -> nn.Module:
+    """Return a network whose dense layers are packed: a `Linear`, or those of an `nn.Sequential`.
+
+    Other parts are the same objects. It runs on the processor.
+    """
+    if isinstance(network, Linear) and network.weight.dtype == torch.float32:
+        return PackedLinear(network)
+    return nn.Sequential(*map(packed, network)) if isinstance(network, nn.Sequential) else network
+
+
 def orthogonal_(weight: Tensor, gain: float, generator: torch.Generator | None = None) -> None:
     """Fill a weight (M, ...) as `torch.nn.init.orthogonal_` does, by the same draws.
 

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from core.places import resolve
 from models.encoder.event_images import nature_layers
 from models.encoder.finetuned import FinetunedEncoder
-from models.encoder.products import Linear, orthogonal_
+from models.encoder.products import Linear, orthogonal_, packed
 from models.encoder.table import dense
 from models.kinds import PolicySpec
 from models.policy.dense_update import tanh
@@ -68,7 +68,8 @@ def by_event_tables(trunk: nn.Module, pi: nn.Module) -> Run:
 
 
 def by_torch(trunk: nn.Module, pi: nn.Module) -> Run:
-    """Run a network that has no faster form."""
+    """Run a network that has no faster form; its dense layers by the weights of this moment."""
+    trunk, pi = packed(trunk), packed(pi)
 
     def run(stacks: np.ndarray, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         with torch.inference_mode():

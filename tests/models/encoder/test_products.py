@@ -16,6 +16,7 @@ from models.encoder.products import (
     LINE,
     ROWS,
     Linear,
+    PackedLinear,
     Product,
     add_product,
     add_product_shared,
@@ -23,6 +24,7 @@ from models.encoder.products import (
     affine,
     dot,
     orthogonal_,
+    packed,
     product,
 )
 
@@ -135,6 +137,25 @@ def test_a_dense_layer_is_torchs_to_rounding(shape, biased):
     torch.testing.assert_close(own.weight.grad, theirs.weight.grad)
     assert own.weight.grad.is_contiguous()
     assert affine(inputs.half(), own.weight.half(), None).dtype == torch.float16
+
+
+@pytest.mark.parametrize("inputs", [1, 17, 1030])
+@pytest.mark.parametrize("outputs", [1, 16, 33])
+def test_packed_dense_layers_have_the_bytes_of_plain_ones(inputs, outputs):
+    torch.manual_seed(inputs)
+    network = torch.nn.Sequential(Linear(inputs, outputs), torch.nn.Tanh(), Linear(outputs, 3, bias=False))
+    own = packed(network)
+    assert isinstance(own[0], PackedLinear)
+    assert own[1] is network[1]
+    for shape in ((0,), (1,), (6,), (7,), (2, 5)):
+        given = torch.randn(*shape, inputs)
+        expected = network(given).detach()
+        assert own(given).numpy().tobytes() == expected.numpy().tobytes()
+    with torch.no_grad():
+        network[0].weight.zero_()
+    assert own(given).numpy().tobytes() == expected.numpy().tobytes()  # by the weights of that moment
+    double = Linear(2, 3).double()
+    assert packed(double) is double
 
 
 def test_a_dot_and_sums_of_rows_are_exact_where_nothing_is_rounded():
