@@ -90,7 +90,7 @@ def _camera(request: Request, chip: str, start: int, count: int) -> tuple[int, i
     if chip.endswith("DVS128") or given == DVS128_SIZE:
         return *DVS128_SIZE, False
     if not chip and given in DAVIS_SIZES.values():
-        return *DAVIS_SIZES[next(name for name, size in DAVIS_SIZES.items() if size == given)], True
+        return *next(size for size in DAVIS_SIZES.values() if size == given), True
     is_wide = not chip and any(
         part["address"].max() >= 1 << 16 for part in mapped_parts(request, start, ENTRY, count)
     )

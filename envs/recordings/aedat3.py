@@ -9,13 +9,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from envs.recordings.event_file import CUT, CUT_PACKETS, TRIGGER, Opened, Part, Request, assemble
+from envs.events import EVENT
+from envs.recordings.event_file import CUT, CUT_PACKETS, TRIGGER, Opened, Request, gathered
 
 MAGIC_3 = b"#!AER-DAT3"
 MAX_HEADER_BYTES = 1 << 20
 MAX_PACKET_BYTES = 1 << 28
 PACKET = struct.Struct("<hhiiiiii")  # type, source, size, place of t, turns of t, capacity, number, valid
-SPECIAL, POLARITY, FRAME, IMU6, IMU9 = range(5)  # types of packets
+SPECIAL, POLARITY, FRAME, IMU6 = range(4)  # types of packets
 WORD = np.dtype([("data", "<u4"), ("t", "<i4")])
 EDGES = {2: (0, 1), 3: (0, -1), 4: (0, 0), 10: (1, 1), 11: (1, -1)}  # special type: channel, edge
 # Sensors by how the header names the source; the first that fits.
@@ -57,7 +58,7 @@ def read_aedat3(request: Request) -> Opened:
     size = next(((w, h) for known, w, h in SIZES if name.startswith(known)), (None, None))
     if None not in size:
         request = request.sized(*size)
-    return Opened("aedat3", request, _parts(request, header, source))
+    return Opened("aedat3", request, gathered(request, EVENT, _packets(request, header, source)))
 
 
 def read_header(request: Request) -> Header:
@@ -112,9 +113,8 @@ def packets(request: Request, header: Header) -> Iterator[tuple[int, int, int, b
             yield kind, source, turns, body
 
 
-def _parts(request: Request, header: Header, source: int | None) -> Iterator[Part]:
-    """Yield the events and triggers of one source."""
-    some, triggers, count = [], [np.empty(0, TRIGGER)], 0
+def _packets(request: Request, header: Header, source: int | None) -> Iterator[np.ndarray]:
+    """Yield the events and triggers of the packets of one source."""
     for kind, number, turns, body in packets(request, header):
         if source is not None and number != source:
             continue
@@ -123,26 +123,15 @@ def _parts(request: Request, header: Header, source: int | None) -> Iterator[Par
             continue
         words = np.frombuffer(body, WORD)
         words = words[words["data"] & 1 == 1]
-        t_us = words["t"].astype(np.int64) + (turns << 31)
+        data, t_us = words["data"], words["t"].astype(np.int64) + (turns << 31)
         if kind == SPECIAL:
-            triggers.append(_triggers(words["data"] >> 1 & 127, t_us))
             request.tally.skipped += len(words)
+            yield _triggers(data >> 1 & 127, t_us)
             continue
-        some.append(np.stack((words["data"].astype(np.int64), t_us)))
-        count += len(words)
-        if count >= request.part_events:
-            yield _part(request, header, some, triggers)
-            some, triggers, count = [], [np.empty(0, TRIGGER)], 0
-    yield _part(request, header, some, triggers)
-
-
-def _part(request: Request, header: Header, some: list[np.ndarray], triggers: list[np.ndarray]) -> Part:
-    """Return the words of some packets as one part."""
-    data, t_us = np.concatenate([np.empty((2, 0), np.int64), *some], axis=1)
-    y = data >> 2 & 0x7FFF
-    if header.from_below:
-        y = ((request.height or 1) - 1 - y) & 0xFFFF
-    return assemble(request, t_us, data >> 17 & 0x7FFF, y, data >> 1 & 1, triggers=np.concatenate(triggers))
+        events, y = np.empty(len(words), EVENT), data >> 2 & 0x7FFF
+        events["t"], events["x"], events["p"] = t_us, data >> 17 & 0x7FFF, data >> 1 & 1
+        events["y"] = (request.height or 1) - 1 - y.astype(np.int64) if header.from_below else y
+        yield events
 
 
 def _triggers(kinds: np.ndarray, t_us: np.ndarray) -> np.ndarray:

@@ -1,18 +1,22 @@
-"""Read AEDAT 4.0, the files of iniVation's DV: packets of compressed flatbuffers in numbered streams.
+"""Read and write AEDAT 4.0, the files of iniVation's DV: compressed flatbuffers in numbered streams.
 
 The walk through the packets checks every offset and the kind of each, so that a damaged file is refused. A
-file that was cut off is read up to there.
+file that was cut off is read up to there. Flatbuffers (google.github.io/flatbuffers, "Internals") are read
+without a library: a struct.error or ValueError means that a buffer is damaged. Written ones have one layout,
+by the schema of dv-processing (IOHeader, EventPacket, FileDataTable): each is a flatbuffer after its size.
 """
 
+import contextlib
 import struct
 from collections.abc import Iterator
+from pathlib import Path
 from typing import NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
 
-from envs.recordings.event_file import CUT, CUT_PACKETS, TRIGGER, Opened, Part, Request, assemble
-from envs.recordings.flatbuffer import Table, root
+from core.files import replaced
+from envs.recordings.event_file import CUT, CUT_PACKETS, TRIGGER, Append, Opened, Request, gathered
 
 MAGIC_4 = b"#!AER-DAT4.0\r\n"
 EVENT_PACKET, PACKET_TABLE = b"EVTS", b"FTAB"  # identifiers of flatbuffers
@@ -20,18 +24,97 @@ TRIGGER_PACKET = b"TRIG"
 MAX_HEADER_BYTES = 1 << 20
 MAX_PACKET_BYTES = 1 << 28
 CODECS = {1: "lz4", 2: "lz4", 3: "zstd", 4: "zstd"}
-PACKED_EVENT = np.dtype(
-    {
-        "names": ["t", "x", "y", "on"],
-        "formats": ["<i8", "<i2", "<i2", "u1"],
-        "offsets": [0, 8, 10, 12],
-        "itemsize": 16,
-    }
-)
+PACKED_EVENT = np.dtype([("t", "<i8"), ("x", "<i2"), ("y", "<i2"), ("p", "u1"), ("pad", "V3")])
 # Channel (1 is the generator) and edge of a type.
 EDGES = {1: (0, 1), 2: (0, -1), 3: (0, 0), 4: (1, 1), 5: (1, -1)}
 BROKEN = (struct.error, ElementTree.ParseError, UnicodeDecodeError, OSError, ValueError)
 DAMAGED = "is damaged or no AEDAT 4.0 file ({}); copy or record it again"
+MAX_PIXELS = 1 << 15  # a coordinate is a signed 16-bit integer
+PACKET_EVENTS = 1 << 14
+LZ4 = 1
+TABLE_PLACE = len(MAGIC_4) + 32  # of the field that says where the table begins
+DESCRIPTION = """<dv version="2.0">
+    <node name="outInfo" path="/outInfo/">
+        <node name="0" path="/outInfo/0/">
+            <attr key="compression" type="string">LZ4</attr>
+            <attr key="originalModuleName" type="string">evade</attr>
+            <attr key="originalOutputName" type="string">events</attr>
+            <attr key="typeDescription" type="string">Array of events (polarity ON/OFF).</attr>
+            <attr key="typeIdentifier" type="string">EVTS</attr>
+            <node name="info" path="/outInfo/0/info/">
+                <attr key="sizeX" type="int">{width}</attr>
+                <attr key="sizeY" type="int">{height}</attr>
+                <attr key="source" type="string">evade</attr>
+            </node>
+        </node>
+    </node>
+</dv>
+"""
+# A row of the table of packets: a flatbuffer's table with five fields.
+PACKET = np.dtype(
+    {
+        "names": ["fields", "pad", "place", "stream", "size", "count", "first_us", "last_us"],
+        "formats": ["<i4", "<i4", "<i8", "<i4", "<i4", "<i8", "<i8", "<i8"],
+    }
+)
+
+
+class Table(NamedTuple):
+    """A table in a flatbuffer, with every offset checked.
+
+    Attributes:
+        buffer: The bytes.
+        place: First byte of the table.
+    """
+
+    buffer: bytes
+    place: int
+
+    def field(self, number: int) -> int | None:
+        """Return the place of a field, or None if it has its default."""
+        (back,) = struct.unpack_from("<i", self.buffer, self.place)
+        if not 0 <= self.place - back < len(self.buffer):
+            raise ValueError("a table points outside its packet")
+        (size,) = struct.unpack_from("<H", self.buffer, self.place - back)
+        if 4 + 2 * number + 2 > size:
+            return None
+        (offset,) = struct.unpack_from("<H", self.buffer, self.place - back + 4 + 2 * number)
+        return self.place + offset if offset else None
+
+    def scalar(self, number: int, code: str, default: float) -> float:
+        """Return a number by its code for `struct`."""
+        place = self.field(number)
+        value: float = default if place is None else struct.unpack_from("<" + code, self.buffer, place)[0]
+        return value
+
+    def vector(self, number: int, size: int) -> tuple[int, int]:
+        """Return the place of the first element of a vector or text, and how many of `size` bytes there are.
+
+        Raises:
+            ValueError: The buffer has no room for them.
+        """
+        place = self.field(number)
+        if place is None:
+            return 0, 0
+        (offset,) = struct.unpack_from("<I", self.buffer, place)
+        (count,) = struct.unpack_from("<I", self.buffer, place + offset)
+        start = place + offset + 4
+        if count * size > len(self.buffer) - start:
+            raise ValueError(f"a packet declares {count} entries and has no room for them")
+        return start, count
+
+    def tables(self, number: int) -> Iterator["Table"]:
+        """Yield the tables of a vector of tables."""
+        start, count = self.vector(number, 4)
+        for place in range(start, start + 4 * count, 4):
+            (offset,) = struct.unpack_from("<I", self.buffer, place)
+            yield Table(self.buffer, place + offset)
+
+
+def root(buffer: bytes) -> Table:
+    """Return the root table of a buffer."""
+    (place,) = struct.unpack_from("<I", buffer)
+    return Table(buffer, place)
 
 
 class Stream(NamedTuple):
@@ -80,7 +163,7 @@ def read_aedat4(request: Request) -> Opened:
     if not layout.is_whole:
         request.tally.damage[CUT_PACKETS] += 1
     request = request.sized(chosen.width, chosen.height)
-    return Opened("aedat4", request, _parts(request, layout, chosen))
+    return Opened("aedat4", request, gathered(request, PACKED_EVENT, _packets(request, layout, chosen)))
 
 
 def read_layout(request: Request) -> Layout:
@@ -162,29 +245,17 @@ def packets(request: Request, layout: Layout, kinds: dict[int, bytes]) -> Iterat
             place += 8 + size
 
 
-def _parts(request: Request, layout: Layout, chosen: Stream) -> Iterator[Part]:
-    """Yield the events of a stream, with the triggers of all streams."""
+def _packets(request: Request, layout: Layout, chosen: Stream) -> Iterator[np.ndarray]:
+    """Yield the events of the packets of a stream, and the triggers of all streams."""
     kinds = {stream.number: stream.kind for stream in layout.streams if stream.kind == TRIGGER_PACKET}
     kinds[chosen.number] = EVENT_PACKET
-    some, triggers, count = [], [np.empty(0, TRIGGER)], 0
     for number, buffer in packets(request, layout, kinds):
-        if number != chosen.number:
-            triggers.append(_triggers(request, buffer))
-            request.tally.skipped += len(triggers[-1])
-            continue
-        some.append(_events(request, buffer))
-        count += len(some[-1])
-        if count >= request.part_events:
-            yield _part(request, some, triggers)
-            some, triggers, count = [], [np.empty(0, TRIGGER)], 0
-    yield _part(request, some, triggers)
-
-
-def _part(request: Request, some: list[np.ndarray], triggers: list[np.ndarray]) -> Part:
-    """Return packets as one part."""
-    packed = np.concatenate([np.empty(0, PACKED_EVENT), *some])
-    on = (packed["on"] != 0).view(np.int8)
-    return assemble(request, packed["t"], packed["x"], packed["y"], on, triggers=np.concatenate(triggers))
+        if number == chosen.number:
+            yield _events(request, buffer)
+        else:
+            triggers = _triggers(request, buffer)
+            request.tally.skipped += len(triggers)
+            yield triggers
 
 
 def _unpacked(body: bytes, codec: str | None, kind: bytes) -> bytes:
@@ -210,7 +281,9 @@ def _events(request: Request, buffer: bytes) -> np.ndarray:
     """Return the events of one flatbuffer `EventPacket`, copied, so that the rest of the packet is freed."""
     with request.refusing(BROKEN, DAMAGED):
         start, count = root(buffer).vector(0, PACKED_EVENT.itemsize)
-    return np.frombuffer(buffer, PACKED_EVENT, count, start).copy()
+    events = np.frombuffer(buffer, PACKED_EVENT, count, start).copy()
+    events["p"] = events["p"] != 0
+    return events
 
 
 def _triggers(request: Request, buffer: bytes) -> np.ndarray:
@@ -240,3 +313,74 @@ def _streams(head: Table) -> Iterator[Stream]:
         yield Stream(
             int(node.get("name", "")), facts.get("typeIdentifier", "").encode("latin-1"), width, height
         )
+
+
+@contextlib.contextmanager
+def aedat4_writer(path: Path, width: int, height: int) -> Iterator[Append]:
+    """Yield a function that adds events to one stream of packets.
+
+    Raises:
+        ValueError: The sensor has more than 32768 columns or rows.
+    """
+    import pyarrow  # half a second, and only for this format
+
+    if max(width, height) > MAX_PIXELS:
+        raise ValueError(f"aedat4 addresses at most {MAX_PIXELS} pixels, got {width}x{height}")
+    codec, rows = pyarrow.Codec("lz4"), []
+    with replaced(path) as part, part.open("wb") as file:
+        file.write(MAGIC_4 + _file_header(DESCRIPTION.format(width=width, height=height).encode()))
+
+        def append(events: np.ndarray, _: np.ndarray | None) -> None:
+            for first in range(0, len(events), PACKET_EVENTS):
+                some = _packed(events[first : first + PACKET_EVENTS])
+                body = codec.compress(_vector(EVENT_PACKET, len(some), some.tobytes()), asbytes=True)
+                file.write(struct.pack("<ii", 0, len(body)))
+                rows.append((0, 0, file.tell(), 0, len(body), len(some), *some["t"][[0, -1]].tolist()))
+                file.write(body)
+
+        yield append
+        table = file.tell()
+        file.write(codec.compress(_packet_table(np.array(rows, PACKET)), asbytes=True))
+        file.seek(TABLE_PLACE)
+        file.write(struct.pack("<q", table))
+
+
+def _packed(events: np.ndarray) -> np.ndarray:
+    """Return events as a packet has them."""
+    packed = np.zeros(len(events), PACKED_EVENT)
+    for name in ("t", "x", "y"):
+        packed[name] = events[name]
+    packed["p"] = events["p"] > 0
+    return packed
+
+
+def _file_header(description: bytes) -> bytes:
+    """Return IOHeader: the codec, where the table begins (still -1), and the description of the streams."""
+    fields = struct.pack("<HHHHH2x", 10, 20, 4, 8, 16)  # sizes of this list and of the table, then places
+    table = struct.pack("<iiqI", 12, LZ4, -1, 4)
+    text = struct.pack("<I", len(description)) + description + b"\0"
+    return _sized(struct.pack("<I4s", 20, b"IOHE") + fields + table + text)
+
+
+def _vector(kind: bytes, count: int, elements: bytes) -> bytes:
+    """Return a flatbuffer whose root table has one field, a vector, that begins 32 bytes from its size."""
+    fields = struct.pack("<HHH2x", 6, 8, 4)
+    return _sized(struct.pack("<I4s", 16, kind) + fields + struct.pack("<iII", 8, 4, count) + elements)
+
+
+def _packet_table(rows: np.ndarray) -> bytes:
+    """Return FileDataTable: a vector of offsets to the rows, which share one list of fields."""
+    fields = struct.pack("<HHHHHHH2x", 14, PACKET.itemsize, 8, 16, 24, 32, 40)
+    list_place = 32 + 4 * len(rows)
+    first = -(-(list_place + len(fields)) // 8) * 8
+    places = first + PACKET.itemsize * np.arange(len(rows))
+    rows["fields"] = places - list_place
+    offsets = (places - 32 - 4 * np.arange(len(rows))).astype("<u4")
+    gap = bytes(first - list_place - len(fields))
+    return _vector(PACKET_TABLE, len(rows), offsets.tobytes() + fields + gap + rows.tobytes())
+
+
+def _sized(buffer: bytes) -> bytes:
+    """Return a flatbuffer after its size, filled up to whole 8 bytes."""
+    buffer += bytes(-(4 + len(buffer)) % 8)
+    return struct.pack("<I", len(buffer)) + buffer

@@ -8,10 +8,9 @@ import numpy as np
 
 from envs.recordings import aedat3, aedat4
 from envs.recordings.event_file import MAX_BYTES, Request, check_file
-from envs.recordings.flatbuffer import root
 from envs.recordings.formats import recognised
 from envs.recordings.hdf5_checks import ERRORS, check_plain, opened
-from envs.recordings.ros_messages import Values
+from envs.recordings.ros import Values
 from envs.recordings.ros_storage import Topic, is_bag_folder, messages, open_bags
 
 # One sample: us, m/s^2, rad/s, on the axes of the sensor.
@@ -108,7 +107,7 @@ def _frames4(request: Request) -> Iterator[Frame]:
     """Yield the frames of an AEDAT 4 file."""
     for buffer in _packets4(request, b"FRME"):
         with request.refusing(BROKEN_FRAME, "has a damaged frame ({}); copy or record it again"):
-            table = root(buffer)
+            table = aedat4.root(buffer)
             t_us, begin_us, end_us = (int(table.scalar(number, "q", 0)) for number in (0, 3, 4))
             channels = CHANNELS[int(table.scalar(5, "b", 0))]
             width, height = int(table.scalar(6, "h", 0)), int(table.scalar(7, "h", 0))
@@ -128,7 +127,7 @@ def _imu4(request: Request) -> Iterator[tuple[Any, ...]]:
     """Yield the inertial samples of an AEDAT 4 file, which are in g and degrees a second."""
     for buffer in _packets4(request, b"IMUS"):
         with request.refusing(aedat4.BROKEN, "has damaged samples ({}); copy or record it again"):
-            for row in root(buffer).tables(0):
+            for row in aedat4.root(buffer).tables(0):
                 t_us = int(row.scalar(0, "q", 0))
                 values = np.array([row.scalar(number, "f", 0.0) for number in range(2, 8)])
                 yield t_us, values[:3] * G, np.deg2rad(values[3:])

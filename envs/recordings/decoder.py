@@ -84,6 +84,8 @@ def decoded_video(path: Path) -> Iterator[Picture]:
 def decoded_images(paths: Sequence[Path]) -> Iterator[Picture]:
     """Yield the pictures of image files, in order; their times are those of 25 pictures a second.
 
+    They are read through numbered links, which ffmpeg takes for one stream.
+
     Raises:
         ValueError: One is no image of the kind that its suffix names, is damaged, or above 2**26 pixels, or
             they are of several kinds or sizes.
@@ -91,15 +93,10 @@ def decoded_images(paths: Sequence[Path]) -> Iterator[Picture]:
     kinds = sorted({path.suffix.lower() for path in paths})
     if len(kinds) != 1:
         raise ValueError(f"{paths[0].parent}: images must be of one kind, got {' '.join(kinds)}; convert one")
-    return _decoded_links(paths, kinds[0])
-
-
-def _decoded_links(paths: Sequence[Path], suffix: str) -> Iterator[Picture]:
-    """Yield the pictures through numbered links, which ffmpeg reads as one stream."""
     with tempfile.TemporaryDirectory() as folder:
         for number, path in enumerate(paths):
-            (Path(folder) / f"{number}{suffix}").symlink_to(path.resolve())
-        options = ["-format_whitelist", "image2", "-f", "image2", "-start_number", "0", "-i", f"%d{suffix}"]
+            (Path(folder) / f"{number}{kinds[0]}").symlink_to(path.resolve())
+        options = ["-format_whitelist", "image2", "-f", "image2", "-start_number", "0", "-i", f"%d{kinds[0]}"]
         count = 0
         for picture in _decoded(paths[0].parent, options, folder):
             yield picture

@@ -1,4 +1,4 @@
-"""Define what readers of event files take and return, and check the columns that they read.
+"""Define what readers and writers of event files take and return, and check the columns that are read.
 
 A reader gets a `Request` and returns an `Opened` file: the sensor's size, and parts of events in the
 order of the file. `envs.recordings.order` puts the parts in the order of time, by one set of rules.
@@ -8,6 +8,7 @@ names the file, the rule and the remedy.
 
 import contextlib
 import dataclasses
+import itertools
 import stat
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
@@ -26,6 +27,7 @@ MAX_BYTES = 1 << 38  # 275 GB; files are read in parts
 MAX_PACKED = 1000  # times a file's size that it may unpack to; events pack to a tenth
 SMALL_BYTES = 1 << 26  # any file may unpack to as many
 PART_EVENTS = 1 << 22  # 55 MB
+CHUNK_EVENTS = 1 << 18  # as many are converted at once when they are written
 
 TRIGGER = np.dtype([("t", "<i8"), ("channel", "<i2"), ("p", "i1")])  # us; +1 rising, -1 falling, 0 pulse
 NO_TRIGGERS = np.empty(0, TRIGGER)
@@ -249,6 +251,8 @@ class Opened:
 
 
 Reader = Callable[[Request], Opened]
+# Adds events to a file that is written, and labels where the format has them.
+Append = Callable[[np.ndarray, np.ndarray | None], None]
 
 
 def check_file(path: Path, max_bytes: int) -> int:
@@ -374,6 +378,31 @@ def assemble(
     return Part(events, None if is_noise is None else _labels(request, is_noise)[good], triggers)
 
 
+def gathered(request: Request, dtype: np.dtype, packets: Iterable[np.ndarray]) -> Iterator[Part]:
+    """Yield what packets contain as parts of about `part_events` events.
+
+    Args:
+        request: The file.
+        dtype: Of the events, with the fields t [us], x, y and p.
+        packets: Arrays (N,) of this dtype, and TRIGGER arrays.
+
+    Raises:
+        ValueError: As `assemble`.
+    """
+    some, triggers, count = [np.empty(0, dtype)], [NO_TRIGGERS], 0
+    for packet in itertools.chain(packets, (None,)):  # None: the end
+        if packet is not None and packet.dtype == TRIGGER:
+            triggers.append(packet)
+        elif packet is not None:
+            some.append(packet)
+            count += len(packet)
+        if packet is None or count >= request.part_events:
+            rows = np.concatenate(some)
+            t_us, x, y, p = (rows[name] for name in ("t", "x", "y", "p"))
+            yield assemble(request, t_us, x, y, p, triggers=np.concatenate(triggers))
+            some, triggers, count = [np.empty(0, dtype)], [NO_TRIGGERS], 0
+
+
 def _labels(request: Request, is_noise: np.ndarray) -> np.ndarray:
     """Return labels as booleans."""
     if not np.isin(is_noise, (0, 1)).all():
@@ -431,3 +460,9 @@ def check_order(events: np.ndarray) -> None:
     if back.any():
         first = int(np.argmax(back)) + 1
         raise ValueError(f"events must be sorted by t; event {first} is older than the one before it")
+
+
+def chunks(events: np.ndarray) -> Iterator[np.ndarray]:
+    """Yield events in parts that are converted at once."""
+    for first in range(0, len(events), CHUNK_EVENTS):
+        yield events[first : first + CHUNK_EVENTS]

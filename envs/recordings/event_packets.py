@@ -4,21 +4,51 @@ The encodings of Prophesee's cameras are streams of words: what a packet does no
 libcaer's and mono are rows of 8 bytes; libcaer_cmp is words of 16 bits, and starts again with each packet.
 """
 
+from typing import NamedTuple
+
 import numba
 import numpy as np
 
 from envs.recordings.event_file import CUT, RESERVED, Part, Request, Tally, assemble, concatenated
-from envs.recordings.prophesee import evt_parts
-from envs.recordings.ros_messages import EventPacket
+from envs.recordings.prophesee import WORDS, evt_parts
 
-WORDS = {"evt2": "<u4", "evt21": "<u8", "evt3": "<u2"}
 ROW = np.dtype([("data", "<u4"), ("t", "<i4")])
 MONO = np.dtype([("t", "<u4"), ("x", "<u2"), ("y", "<u2")])
 TIME_HIGH, TIME_LOW, ADDRESS_X, ADDRESS_Y, BASE_Y, VECTOR_8 = range(6)  # types of words of libcaer_cmp
 
 
+class EventArray(NamedTuple):
+    """A message of dvs_msgs or prophesee_event_msgs.
+
+    Attributes:
+        width, height: Pixels of the sensor.
+        columns: int64 (4, N): t [us], x, y, p in {0, 1}.
+    """
+
+    width: int
+    height: int
+    columns: np.ndarray
+
+
+class EventPacket(NamedTuple):
+    """A message of event_camera_msgs.
+
+    Attributes:
+        width, height: Pixels of the sensor.
+        time_base_ns: Added to the times of the packet, by some encodings.
+        encoding: Such as "evt3".
+        body: The bytes of the camera.
+    """
+
+    width: int
+    height: int
+    time_base_ns: int
+    encoding: str
+    body: bytes
+
+
 class PacketDecoder:
-    """Collects packets, and decodes them together."""
+    """Collects the messages of a topic, and decodes packets together."""
 
     def __init__(self, request: Request) -> None:
         self._request = request
@@ -26,13 +56,15 @@ class PacketDecoder:
         self._rows: list[np.ndarray] = [np.empty((4, 0), np.int64)]
         self._states: dict[str, np.ndarray] = {}
 
-    def add(self, packet: EventPacket) -> None:
+    def add(self, packet: EventArray | EventPacket) -> None:
         """Take a packet.
 
         Raises:
             ValueError: Its encoding is not known.
         """
-        if packet.encoding in WORDS:
+        if isinstance(packet, EventArray):
+            self._rows.append(packet.columns)
+        elif packet.encoding in WORDS:
             self._words.setdefault(packet.encoding, []).append(packet.body)
         elif packet.encoding in ROWS:
             self._rows.append(ROWS[packet.encoding](packet, self._request.tally))
@@ -46,7 +78,7 @@ class PacketDecoder:
         """Return the events and triggers of the packets since the last call."""
         found: list[Part] = []
         for encoding, bodies in self._words.items():
-            dtype = np.dtype(WORDS[encoding])
+            dtype = WORDS[encoding]
             raw = b"".join(body[: len(body) // dtype.itemsize * dtype.itemsize] for body in bodies)
             words = np.frombuffer(raw, dtype)
             found += evt_parts(self._request, encoding, words, states=self._states)
@@ -127,12 +159,8 @@ def decode_libcaer_cmp(  # noqa: C901  a branch for each type of word
             reserved += 1
         for bit in range(8):
             if mask >> bit & 1:
-                columns[0, n], columns[1, n], columns[2, n], columns[3, n] = (
-                    base_us + (high | low),
-                    x,
-                    y + bit,
-                    p,
-                )
+                columns[0, n], columns[1, n] = base_us + (high | low), x
+                columns[2, n], columns[3, n] = y + bit, p
                 n += 1
         y += 8 if kind == VECTOR_8 else 0
     return n, reserved

@@ -11,7 +11,7 @@ import numpy as np
 
 from envs.events import EVENT
 from envs.recordings.event_file import CUT, Opened, Part, Request
-from envs.recordings.mapped import Mapped
+from envs.recordings.mapped import mapped
 
 MAGIC_ES = b"Event Stream"
 HEADER_BYTES = len(MAGIC_ES) + 8  # version 3, type 1, width 2, height 2
@@ -45,14 +45,15 @@ def _parts(request: Request, is_atis: bool) -> Iterator[Part]:
     size = request.path.stat().st_size - HEADER_BYTES
     if not size:
         return
-    mapped, state = Mapped(request, HEADER_BYTES, np.dtype("u1"), size), np.zeros(3, np.int64)
+    raw, forget = mapped(request, HEADER_BYTES, np.dtype("u1"), size)
+    state = np.zeros(3, np.int64)
     while True:
         events = np.empty(min(request.part_events, size // EVENT_BYTES + 1), EVENT)
         before = int(state[EXPOSURES])
-        n = decode_es(mapped.values, is_atis, request.height or 0, state, events)
+        n = decode_es(raw, is_atis, request.height or 0, state, events)
         request.tally.skipped += int(state[EXPOSURES]) - before
         yield Part(events[:n])
-        mapped.forget(int(state[PLACE]))
+        forget(int(state[PLACE]))
         if n < len(events):
             break
     if state[PLACE] < size:

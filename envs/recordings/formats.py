@@ -8,21 +8,17 @@ from typing import Any, NamedTuple
 
 from envs.recordings.aedat2 import MAGIC_2, read_aedat2
 from envs.recordings.aedat3 import MAGIC_3, read_aedat3
-from envs.recordings.aedat4 import MAGIC_4, read_aedat4
-from envs.recordings.aedat4_writer import aedat4_writer
-from envs.recordings.event_file import Reader
+from envs.recordings.aedat4 import MAGIC_4, aedat4_writer, read_aedat4
+from envs.recordings.event_file import Append, Reader
 from envs.recordings.event_stream import MAGIC_ES, read_es
 from envs.recordings.hdf5_layouts import read_hdf5
 from envs.recordings.hdf5_writer import hdf5_writer
 from envs.recordings.nmnist import read_nmnist
-from envs.recordings.npz import read_npy, read_npz
-from envs.recordings.plain_writers import npz_writer, text_writer
-from envs.recordings.prophesee import read_dat, read_evt
-from envs.recordings.prophesee_writers import dat_writer, evt2_writer, evt3_writer
+from envs.recordings.npz import npz_writer, read_npy, read_npz
+from envs.recordings.prophesee import dat_writer, evt2_writer, evt3_writer, read_dat, read_evt
 from envs.recordings.ros import read_ros
 from envs.recordings.ros_storage import MAGIC_BAG, MAGIC_DB3, MAGIC_MCAP
-from envs.recordings.text import read_text
-from envs.recordings.writing import Append
+from envs.recordings.text import read_text, text_writer
 
 Writer = Callable[..., AbstractContextManager[Append]]
 

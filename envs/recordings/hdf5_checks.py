@@ -13,6 +13,7 @@ import io
 import mmap
 import struct
 from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -41,19 +42,23 @@ MAX_NODES, MAX_DEPTH = 10_000, 5  # of a listing
 
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[h5py.File]:
-    """Open a file whose heaps do not lead in a circle."""
+    """Open a file whose heaps do not lead in a circle, also if it was cut off."""
     check_heaps(path)
-    with _open(path) as file:
+    length = _declared_bytes(path)
+    source: AbstractContextManager[Any] = contextlib.nullcontext(path)
+    if length > path.stat().st_size:
+        source = CutFile(path, length)
+    with source as name, h5py.File(name, "r") as file:
         yield file
 
 
-class CutFile(io.RawIOBase):
+class CutFile(io.FileIO):
     """A file with its declared length; reading beyond its end is an error."""
 
     def __init__(self, path: Path, length: int) -> None:
         """Open the file for reading."""
-        self._path, self._file, self._length = path, path.open("rb", buffering=0), length
-        self._end, self._place = path.stat().st_size, 0
+        super().__init__(path)
+        self._path, self._length, self._end = path, length, path.stat().st_size
 
     def __repr__(self) -> str:
         """Return the path, which HDF5 takes for the file's name."""
@@ -61,34 +66,13 @@ class CutFile(io.RawIOBase):
 
     def seek(self, offset: int, whence: int = 0) -> int:
         """Move to a byte."""
-        self._place = offset + {0: 0, 1: self._place, 2: self._length}[whence]
-        return self._place
-
-    def tell(self) -> int:
-        """Return the byte that is next."""
-        return self._place
+        return super().seek(self._length + offset) if whence == 2 else super().seek(offset, whence)
 
     def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
         """Read bytes that are there."""
-        if self._place + len(buffer) > self._end:
+        if self.tell() + len(buffer) > self._end:
             raise OSError(f"the file was cut off at byte {self._end}")
-        self._file.seek(self._place)
-        count = self._file.readinto(buffer) or 0
-        self._place += count
-        return count
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
-        super().close()
-
-
-def _open(path: Path) -> h5py.File:
-    """Open a file for reading, also if it was cut off."""
-    length = _declared_bytes(path)
-    if length <= path.stat().st_size:
-        return h5py.File(path, "r")
-    return h5py.File(CutFile(path, length), "r")
+        return super().readinto(buffer) or 0
 
 
 def is_cut(file: h5py.File) -> bool:
@@ -180,16 +164,22 @@ def time_offset(file: h5py.File) -> int:
 
 def check_plain(file: h5py.File, name: str, ndim: int) -> None:
     """Refuse links, virtual and external data, other types than numbers, and huge chunks."""
+    data = plain(file, name, ndim)
+    fields = [data.dtype[field] for field in data.dtype.names] if data.dtype.names else [data.dtype]
+    if not all(field.kind in "iufb" for field in fields):
+        raise ValueError(f"{name} contains {data.dtype}, not numbers")
+    check_chunks(data, name)
+
+
+def plain(file: h5py.File, name: str, ndim: int) -> h5py.Dataset:
+    """Return a data set; refuse links, and virtual and external data."""
     parts = name.split("/")
     for end in range(1, len(parts) + 1):
         check_own(file, "/".join(parts[:end]))
     data = file[name]
     if not isinstance(data, h5py.Dataset) or data.ndim != ndim or data.external or data.is_virtual:
         raise ValueError(f"{name} is not a plain data set of {ndim} dimensions")
-    fields = [data.dtype[field] for field in data.dtype.names] if data.dtype.names else [data.dtype]
-    if not all(field.kind in "iufb" for field in fields):
-        raise ValueError(f"{name} contains {data.dtype}, not numbers")
-    check_chunks(data, name)
+    return data
 
 
 def check_own(file: h5py.File, name: str) -> None:

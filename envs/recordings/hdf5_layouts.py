@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import h5py
 import numpy as np
 
+from envs.recordings.ecf import metavision_parts
 from envs.recordings.event_file import Opened, Part, Request, assemble
 from envs.recordings.hdf5_checks import (
     CUT_ERRORS,
@@ -23,13 +24,11 @@ from envs.recordings.hdf5_checks import (
     row_parts,
     time_offset,
 )
-from envs.recordings.metavision_hdf5 import metavision_parts
 from envs.recordings.names import COLUMNS, column_of, microseconds, roles, usual_unit
-from envs.recordings.npz import table_order
+from envs.recordings.npz import FIRST_ROWS, table_order
 
 NOISE = "events/is_noise"  # labels, where there are any
 UNREADABLE = "is no readable HDF5 event file ({}); copy or write it again"
-FIRST_ROWS = 1 << 16
 
 
 class Layout(NamedTuple):

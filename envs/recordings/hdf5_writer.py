@@ -9,9 +9,9 @@ import h5py
 import numpy as np
 
 from core.files import replaced
+from envs.recordings.event_file import Append
 from envs.recordings.hdf5 import check_span
 from envs.recordings.hdf5_layouts import NOISE
-from envs.recordings.writing import Append
 
 CHUNK = 1 << 16
 TYPES = {"events/t": "i8", "events/x": "u2", "events/y": "u2", "events/p": "u1"}

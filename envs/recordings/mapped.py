@@ -2,7 +2,7 @@
 
 import contextlib
 import mmap
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
@@ -11,30 +11,33 @@ from envs.recordings.event_file import Request
 PAGE = mmap.ALLOCATIONGRANULARITY
 
 
-class Mapped:
-    """The bytes of a file behind its header, as an array, without copying them into memory."""
+def mapped(
+    request: Request, start: int, dtype: np.dtype, count: int
+) -> tuple[np.ndarray, Callable[[int], None]]:
+    """Map a file from byte `start` on, without copying it into memory.
 
-    def __init__(self, request: Request, start: int, dtype: np.dtype, count: int) -> None:
-        """Map `count` entries of a dtype from byte `start` on."""
-        self._start, self._itemsize = start, dtype.itemsize
-        with request.path.open("rb") as file:
-            self._map = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-        self.values = np.frombuffer(self._map, dtype, count, start)
+    Returns:
+        `count` entries of the dtype, and a function that takes the entries before a place out of memory;
+        they are read again if they are needed.
+    """
+    with request.path.open("rb") as file:
+        whole = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
 
-    def forget(self, stop: int) -> None:
-        """Take the entries before `stop` out of memory; they are read again if they are needed."""
-        size = (self._start + stop * self._itemsize) // PAGE * PAGE
+    def forget(stop: int) -> None:
+        size = (start + stop * dtype.itemsize) // PAGE * PAGE
         if size:
             with contextlib.suppress(OSError, AttributeError, ValueError):  # a hint: not every system has it
-                self._map.madvise(mmap.MADV_DONTNEED, 0, size)
+                whole.madvise(mmap.MADV_DONTNEED, 0, size)
+
+    return np.frombuffer(whole, dtype, count, start), forget
 
 
 def mapped_parts(request: Request, start: int, dtype: np.dtype, count: int) -> Iterator[np.ndarray]:
     """Yield the entries of a file in parts of about `part_events` entries."""
     if not count:
         return
-    mapped = Mapped(request, start, dtype, count)
+    values, forget = mapped(request, start, dtype, count)
     for first in range(0, count, request.part_events):
         stop = min(count, first + request.part_events)
-        yield mapped.values[first:stop]
-        mapped.forget(stop)
+        yield values[first:stop]
+        forget(stop)

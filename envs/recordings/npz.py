@@ -1,19 +1,23 @@
-"""Read npz and npy files of any names, and zip files of one text.
+"""Read npz and npy files of any names, and zip files of one text; write npz files.
 
 Arrays are found by their names. Nothing is unpickled, and nothing is unpacked before its header is known
 to be sound. Columns are read side by side, in parts.
 """
 
 import contextlib
+import shutil
+import tempfile
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import IO, NamedTuple
+from pathlib import Path
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 
-from envs.recordings.event_file import CUT, CUT_TABLE, Opened, Part, Request, assemble
+from core.files import replaced
+from envs.recordings.event_file import CUT, CUT_TABLE, Append, Opened, Part, Request, assemble
 from envs.recordings.names import COLUMNS, column_of, microseconds, roles, usual_unit
 from envs.recordings.npz_cut import cut_members
 from envs.recordings.text import read_text
@@ -21,6 +25,8 @@ from envs.recordings.text import read_text
 MAX_HEADER_BYTES = 1 << 16
 NOISE = "is_noise"  # an array that labels each event, if there is one
 ROWS = 4  # columns of a table
+FIRST_ROWS = 1 << 16  # by which the order of the columns of a table is told
+WRITTEN = {name: np.dtype(code) for name, code in (("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "u1"))}
 BROKEN = (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, ValueError)
 UNREADABLE = "is no readable array file ({}); copy or save it again"
 # Sizes of the data sets whose files do not say them, by the name of their array.
@@ -151,7 +157,9 @@ def _opened(request: Request, format: str, arrays: dict[str, Array]) -> Opened:
     count = request.check_declared(next(iter(lengths.values())))
     request = _sized(request, arrays, used)
     name = columns[0].field if isinstance(columns[0].field, str) else columns[0].array
-    unit = _text(request, arrays, "time_unit") or roles(request, [name])[1]
+    unit = roles(request, [name])[1]
+    if "time_unit" in arrays:
+        unit = str(_one(request, arrays, "time_unit")) or unit
     if "timestamp_scale_ms" in arrays:
         unit = {1e3: "s", 1.0: "ms", 1e-3: "us", 1e-6: "ns"}.get(
             float(_one(request, arrays, "timestamp_scale_ms"))
@@ -245,22 +253,17 @@ def table_order(request: Request, name: str, rows: np.ndarray) -> tuple[str, ...
     Raises:
         ValueError: The numbers fit none or two orders.
     """
-    if rows.shape[1] != ROWS or not len(rows):
-        raise _no_order(request, name)
-    signs = rows[:, 3].astype(np.float64)
-    signs = np.where(signs > 1 << 31, -1.0, signs)
-    rises = [bool((np.diff(rows[:, place].astype(np.float64)) >= 0).all()) for place in (0, 2)]
-    spans = [float(np.ptp(rows[:, place].astype(np.float64))) for place in (0, 2)]
-    if rises == [True, True]:  # pixels may rise too, but no further than a sensor reaches
-        rises = [spans[0] >= spans[1], spans[1] > spans[0]]
-    if not np.isin(signs, (-1, 0, 1)).all() or rises == [False, False]:
-        raise _no_order(request, name)
-    return ("t", "x", "y", "p") if rises[0] else ("x", "y", "t", "p")
-
-
-def _no_order(request: Request, name: str) -> ValueError:
-    """Return the refusal for a table whose columns are not known."""
-    return request.refusal(
+    if rows.shape[1] == ROWS and len(rows):
+        signs = rows[:, 3].astype(np.float64)
+        signs = np.where(signs > 1 << 31, -1.0, signs)
+        others = [rows[:, place].astype(np.float64) for place in (0, 2)]
+        rises = [bool((np.diff(values) >= 0).all()) for values in others]
+        if rises == [True, True]:  # pixels may rise too, but no further than a sensor reaches
+            is_first = bool(np.ptp(others[0]) >= np.ptp(others[1]))
+            rises = [is_first, not is_first]
+        if np.isin(signs, (-1, 0, 1)).all() and any(rises):
+            return ("t", "x", "y", "p") if rises[0] else ("x", "y", "t", "p")
+    raise request.refusal(
         f"the table {name} does not name its columns; give columns= in their order, such as "
         "('x', 'y', 't', 'p')"
     )
@@ -270,11 +273,7 @@ def _first_rows(request: Request, array: Array) -> np.ndarray:
     """Return the first rows of a table."""
     with array.open() as file:
         _shape(request, file, array.name)
-        width, count = array.shape[1], min(1 << 16, array.shape[0])
-        raw = file.read(count * width * array.dtype.itemsize)
-    return np.frombuffer(raw, array.dtype, len(raw) // array.dtype.itemsize // width * width).reshape(
-        -1, width
-    )
+        return _next(request, file, array, min(FIRST_ROWS, array.shape[0]))
 
 
 def _parts(
@@ -348,12 +347,44 @@ def _one(request: Request, arrays: dict[str, Array], name: str) -> np.ndarray:
     return np.frombuffer(raw, array.dtype)[0]
 
 
-def _text(request: Request, arrays: dict[str, Array], name: str) -> str | None:
-    """Return the text of an array, or None."""
-    return str(_one(request, arrays, name)) if name in arrays else None
-
-
 def _listing(arrays: dict[str, Array]) -> str:
     """Return the arrays of a file in words."""
     shown = [f"{array.name} {array.dtype} {array.shape}" for array in list(arrays.values())[:12]]
     return f"it contains {', '.join(shown) or 'no arrays'}"
+
+
+@contextlib.contextmanager
+def npz_writer(path: Path, width: int, height: int, is_labelled: bool) -> Iterator[Append]:
+    """Yield a function that adds events to an npz file, compressed: t (int64 us), x, y (uint16), p (0, 1).
+
+    A column must be whole before the next begins, so columns wait in files beside it. The sensor's size,
+    and the unit of the times in two ways, are there as EventCV and this project have them.
+    """
+    types: dict[str, np.dtype] = WRITTEN | ({NOISE: np.dtype(bool)} if is_labelled else {})
+    count = 0
+    with replaced(path) as part, contextlib.ExitStack() as stack:
+        files = {name: stack.enter_context(tempfile.TemporaryFile(dir=path.parent)) for name in types}
+
+        def append(events: np.ndarray, is_noise: np.ndarray | None) -> None:
+            nonlocal count
+            count += len(events)
+            columns: dict[str, Any] = {name: events[name] for name in COLUMNS} | {
+                "p": events["p"] > 0,
+                NOISE: is_noise,
+            }
+            for name, dtype in types.items():
+                files[name].write(np.ascontiguousarray(columns[name], dtype).tobytes())
+
+        yield append
+        facts = {"width": np.array([width], "<u8"), "height": np.array([height], "<u8")}
+        facts |= {"timestamp_scale_ms": np.array([1e-3]), "time_unit": np.array("us")}
+        with zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as archive:
+            for name, dtype in types.items():
+                header = {"descr": dtype.str, "fortran_order": False, "shape": (count,)}
+                with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                    np.lib.format.write_array_header_1_0(member, header)
+                    files[name].seek(0)
+                    shutil.copyfileobj(files[name], member, 1 << 20)
+            for name, value in facts.items():
+                with archive.open(f"{name}.npy", "w") as member:
+                    np.lib.format.write_array(member, value)

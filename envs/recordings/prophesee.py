@@ -1,18 +1,32 @@
-"""Read files of Prophesee cameras: DAT, and RAW with the encodings EVT 2.0, EVT 2.1 and EVT 3.0.
+"""Read files of Prophesee cameras, DAT and RAW with EVT 2.0, EVT 2.1 and EVT 3.0; write all but EVT 2.1.
 
 Both begin with lines `% name value`, and the names tell them apart. From the published descriptions
 (docs.prophesee.ai: "DAT File Format", "EVT 2.0 Format", "EVT 2.1 Format", "EVT 3.0 Format").
 """
 
+import contextlib
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 
+from core.files import replaced
 from envs.events import EVENT
-from envs.recordings.event_file import OUTSIDE, RESERVED, TRIGGER, Opened, Part, Request, whole_entries
+from envs.recordings.event_file import (
+    OUTSIDE,
+    RESERVED,
+    TRIGGER,
+    Append,
+    Opened,
+    Part,
+    Request,
+    chunks,
+    whole_entries,
+)
 from envs.recordings.evt_decoders import State, decode_dat, decode_evt2, decode_evt3, new_state
-from envs.recordings.mapped import Mapped, mapped_parts
+from envs.recordings.mapped import mapped, mapped_parts
 
 MAX_HEADER_BYTES = 1 << 16
 DAT_WORD = np.dtype([("t", "<u4"), ("data", "<u4")])
@@ -21,6 +35,11 @@ FEW_RESERVED = 16  # words of types that do not exist; more than an eighth of al
 MAX_TRIGGERS = 1 << 16  # of a part
 NAMES = {"EVT2": "evt2", "2.0": "evt2", "EVT21": "evt21", "2.1": "evt21", "EVT3": "evt3", "3.0": "evt3"}
 
+# Words of the encodings.
+WORDS: dict[str, np.dtype] = {"evt2": np.dtype("<u4"), "evt21": np.dtype("<u8"), "evt3": np.dtype("<u2")}
+# Clock bits and coordinate bits, and so the first time that does not fit.
+LIMITS = {"dat": (32, 14), "evt2": (34, 11), "evt3": (24, 11)}
+MAX_WORDS = 1 << 26  # of a part: a gap of 76 hours in EVT 3.0
 # Sensors by the name of the camera plug-in, for files that state no geometry.
 SENSORS = (("genx320", 320, 320), ("imx636", 1280, 720), ("gen4", 1280, 720), ("gen3", 640, 480))
 
@@ -73,10 +92,10 @@ def read_evt(request: Request, format: str | None = None) -> Opened:
     endianness = options.get("endianness", "little")
     if endianness not in ("little", "legacy"):
         raise request.refusal(f"has {endianness}-endian words; little-endian ones are read: write it again")
-    word = np.dtype({"evt3": "<u2", "evt2": "<u4", "evt21": "<u8"}[encoding])
+    word = WORDS[encoding]
     count = whole_entries(request, start, word.itemsize)
-    mapped = Mapped(request, start, word, count)
-    parts = evt_parts(request, encoding, mapped.values, endianness, mapped.forget)
+    words, forget = mapped(request, start, word, count)
+    parts = evt_parts(request, encoding, words, endianness, forget)
     return Opened(encoding, request, parts)
 
 
@@ -198,12 +217,136 @@ def _geometry(fields: dict[str, str], options: dict[str, str]) -> tuple[int | No
     if _number(width) and _number(height):
         return _number(width), _number(height)
     plugin = fields.get("plugin_name", "")
-    for name, sensor_width, sensor_height in SENSORS:
-        if name in plugin:
-            return sensor_width, sensor_height
-    return None, None
+    return next(((width, height) for name, width, height in SENSORS if name in plugin), (None, None))
 
 
 def _number(text: str | None) -> int | None:
     """Return a size of a sensor in decimal digits, or None."""
     return int(text) if text and text.isascii() and text.isdigit() and 0 < len(text) < 6 else None
+
+
+def dat_writer(path: Path, width: int, height: int) -> AbstractContextManager[Append]:
+    """Yield a function that adds events to a DAT file.
+
+    Raises:
+        ValueError: The format's clock or address cannot represent them.
+    """
+    lines = f"% Data file containing CD events\n% Version 2\n% Width {width}\n% Height {height}\n"
+    return _writer(path, width, height, "dat", lines.encode() + bytes((0x0C, 8)), _dat_words)
+
+
+def evt2_writer(path: Path, width: int, height: int) -> AbstractContextManager[Append]:
+    """Yield a function that adds events to a RAW file of EVT 2.0; raises as `dat_writer`."""
+    return _writer(path, width, height, "evt2", _evt_header("2.0", width, height), _Evt2())
+
+
+def evt3_writer(path: Path, width: int, height: int) -> AbstractContextManager[Append]:
+    """Yield a function that adds events to a RAW file of EVT 3.0; raises as `dat_writer`."""
+    return _writer(path, width, height, "evt3", _evt_header("3.0", width, height), _Evt3(path))
+
+
+@contextlib.contextmanager
+def _writer(
+    path: Path,
+    width: int,
+    height: int,
+    format: str,
+    header: bytes,
+    words: Callable[[np.ndarray], np.ndarray],
+) -> Iterator[Append]:
+    """Yield a function that adds the words of events behind a header."""
+    clock_bits, address_bits = LIMITS[format]
+    if max(width, height) > 1 << address_bits:
+        raise ValueError(f"{format} addresses at most {1 << address_bits} pixels, got {width}x{height}")
+    with replaced(path) as part, part.open("wb") as file:
+        file.write(header)
+        is_first = True
+
+        def append(events: np.ndarray, _: np.ndarray | None) -> None:
+            nonlocal is_first
+            _check_clock(events, format, clock_bits, is_first)
+            is_first = is_first and not len(events)
+            for some in chunks(events):
+                file.write(words(some).tobytes())
+
+        yield append
+
+
+def _check_clock(events: np.ndarray, format: str, bits: int, is_first: bool) -> None:
+    """Refuse times that the clock cannot represent: EVT 3.0 counts its turns, but has none for the first."""
+    which = "first" if format == "evt3" else "last"
+    if not len(events) or (which == "first" and not is_first):
+        return
+    clocked = int(events["t"][0 if which == "first" else -1])
+    if clocked >= 1 << bits:
+        raise ValueError(
+            f"{format} has a clock of {bits} bits: the {which} event must be before {1 << bits} us, got "
+            f"{clocked}; subtract the time of the first event, or choose another format"
+        )
+
+
+def _evt_header(version: str, width: int, height: int) -> bytes:
+    """Return the header of a RAW file."""
+    name = "EVT" + version[0]
+    lines = f"% evt {version}\n% format {name};height={height};width={width}\n"
+    return f"{lines}% geometry {width}x{height}\n% end\n".encode()
+
+
+def _dat_words(events: np.ndarray) -> np.ndarray:
+    """Return entries of DAT."""
+    words = np.empty(len(events), DAT_WORD)
+    words["t"] = events["t"]
+    words["data"] = (
+        events["x"] | events["y"].astype(np.uint32) << 14 | (events["p"] > 0).astype(np.uint32) << 28
+    )
+    return words
+
+
+class _Evt2:
+    """Words of EVT 2.0: a high part of the time wherever it changes, then the event."""
+
+    def __init__(self) -> None:
+        self._high = -1
+
+    def __call__(self, events: np.ndarray) -> np.ndarray:
+        """Return the words of the next events, uint32."""
+        t = events["t"]
+        words = (events["p"] > 0).astype(np.uint32) << 28 | (t & 63).astype(np.uint32) << 22
+        words |= events["x"].astype(np.uint32) << 11 | events["y"]
+        changes = np.flatnonzero(np.diff(t >> 6, prepend=self._high))
+        self._high = int(t[-1]) >> 6
+        return np.insert(words, changes, np.uint32(8 << 28) | (t[changes] >> 6).astype(np.uint32)).astype(
+            "<u4"
+        )
+
+
+class _Evt3:
+    """Words of EVT 3.0 without vectors, with every high part of the time, as a camera sends them."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._high, self._low, self._y = path, -1, -1, -1
+
+    def __call__(self, events: np.ndarray) -> np.ndarray:
+        """Return the words of the next events, uint16."""
+        high, low, y = events["t"] >> 12, events["t"] & 0xFFF, events["y"].astype(np.int64)
+        before = self._high if self._high >= 0 else int(high[0]) - 1
+        steps = np.diff(high, prepend=before)
+        new_low = (steps > 0) | (np.diff(low, prepend=self._low) != 0)
+        new_y = np.diff(y, prepend=self._y) != 0
+        last = np.cumsum(steps + new_low + new_y + 1) - 1  # where the word with x of each event goes
+        if last[-1] >= MAX_WORDS:
+            raise ValueError(
+                f"{self._path}: evt3 needs {last[-1] + 1} words for gaps this long; choose npz or hdf5"
+            )
+        words = np.empty(last[-1] + 1, "<u2")
+        is_high = np.ones(len(words), bool)
+        for places, values in (
+            (last, 0x2000 | (events["p"] > 0).astype(np.int64) << 11 | events["x"]),
+            ((last - 1)[new_y], y[new_y]),
+            ((last - 1 - new_y)[new_low], 0x6000 | low[new_low]),
+        ):
+            words[places] = values
+            is_high[places] = False
+        words[is_high] = 0x8000 | np.arange(before + 1, high[-1] + 1) & 0xFFF
+        self._high, self._low, self._y = int(high[-1]), int(low[-1]), int(y[-1])
+        return words

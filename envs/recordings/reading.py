@@ -1,7 +1,6 @@
 """Read events of any format: a whole file, a range of its times, or part by part."""
 
 import copy
-import dataclasses
 import itertools
 import warnings
 from collections.abc import Iterator, Sequence
@@ -77,7 +76,7 @@ def read_events(  # noqa: PLR0913  each is something else that a file may not sa
         ValueError: The file is no regular file, of no known format, too large, damaged beyond what is
             tolerated, or breaks a rule of its format; the message names the file, the rule and the remedy.
     """
-    opened = _opened(locals())
+    opened = _opened(**locals())
     request = opened.request
     try:
         if request.is_range:
@@ -141,7 +140,7 @@ def read_parts(  # noqa: PLR0913  as above
     """
     if part_events < 1:
         raise ValueError(f"part_events must be at least 1, got {part_events}")
-    return _parts(_opened(locals() | {"max_events": 1 << 62}))
+    return _parts(_opened(**locals(), max_events=1 << 62))
 
 
 def _parts(opened: Opened) -> Iterator[EventFile]:
@@ -162,44 +161,47 @@ def _parts(opened: Opened) -> Iterator[EventFile]:
         yield empty or _file(opened, Part(np.empty(0, EVENT)), tally)
 
 
-def _opened(arguments: dict[str, Any]) -> Opened:
+def _opened(
+    path: str | Path,
+    format: str | None,
+    *,
+    max_events: int | None,
+    max_bytes: int = MAX_BYTES,
+    columns: Sequence[str] | None = None,
+    **options: Any,
+) -> Opened:
     """Open the file that the arguments of `read_events` describe."""
-    path, format = Path(arguments["path"]), arguments["format"]
+    path = Path(path)
     if is_bag_folder(path):
         size, kind = sum(one.stat().st_size for one in path.iterdir() if one.is_file()), format or "ros"
         if kind != "ros":
             raise ValueError(f"{path}: is the folder of a ROS bag and no {kind} file; leave format out")
     else:
-        size = check_file(path, arguments["max_bytes"])
+        size = check_file(path, max_bytes)
         kind = format or recognised(path)
-    if kind not in TABLE or TABLE[kind].read is None:
+    if kind not in TABLE or (read := TABLE[kind].read) is None:
         raise ValueError(f"{path}: format must be one of {', '.join(FORMATS)}, got {format!r}")
-    if arguments["time_unit"] is not None and arguments["time_unit"] not in US_PER:
-        raise ValueError(f"time_unit must be one of {', '.join(US_PER)}, got {arguments['time_unit']!r}")
-    check_options(path, kind, arguments)
-    columns, most = arguments["columns"], arguments["max_events"]
-    names = {field.name for field in dataclasses.fields(Request)} - {"path", "columns", "max_events"}
+    unit = options.get("time_unit")
+    if unit is not None and unit not in US_PER:
+        raise ValueError(f"time_unit must be one of {', '.join(US_PER)}, got {unit!r}")
+    check_options(path, kind, {"columns": columns, **options})
     request = Request(
         path,
         columns=None if columns is None else tuple(columns),
-        max_events=usual_events(size) if most is None else most,
-        **{name: value for name, value in arguments.items() if name in names},
+        max_events=usual_events(size) if max_events is None else max_events,
+        **options,
     )
-    read = TABLE[kind].read
-    assert read is not None  # noqa: S101  for the type checker
     return read(request)
 
 
 def _within(parts: Iterator[Part], request: Request) -> Iterator[Part]:
     """Yield what lies in the range of times of a request, and stop after it."""
-    start, end = request.start_us, request.end_us
+    start = np.iinfo(np.int64).min if request.start_us is None else request.start_us
+    end = np.iinfo(np.int64).max if request.end_us is None else request.end_us
     for part in parts:
         t_us, triggers = part.events["t"], part.triggers
-        first = 0 if start is None else int(np.searchsorted(t_us, start))
-        last = len(t_us) if end is None else int(np.searchsorted(t_us, end))
-        inside = np.ones(len(triggers), bool)
-        inside &= triggers["t"] >= start if start is not None else True
-        inside &= triggers["t"] < end if end is not None else True
+        first, last = int(np.searchsorted(t_us, start)), int(np.searchsorted(t_us, end))
+        inside = (triggers["t"] >= start) & (triggers["t"] < end)
         some = part.rows(slice(first, last))
         yield Part(some.events.copy(), some.is_noise, triggers[inside])
         if last < len(t_us):

@@ -8,15 +8,62 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from envs.recordings.event_file import CUT, CUT_PACKETS, Opened, Part, Request, assemble
-from envs.recordings.event_packets import PacketDecoder
-from envs.recordings.ros_messages import EventArray, EventPacket, Values, event_array, event_packet
+from envs.recordings.event_file import CUT, CUT_PACKETS, Opened, Part, Request
+from envs.recordings.event_packets import EventArray, EventPacket, PacketDecoder
 from envs.recordings.ros_storage import Bag, Message, Topic, messages, open_bags
 
 # Types of messages with events, and with arrays of packed bytes.
 ARRAYS = ("dvs_msgs/EventArray", "prophesee_event_msgs/EventArray")
 PACKETS = ("event_camera_msgs/EventPacket", "event_array_msgs/EventArray")
 MIN_BYTES = 2  # of an event, about
+# An event of ROS 1: x, y, seconds, nanoseconds, polarity, without gaps.
+EVENT_1 = np.dtype([("x", "<u2"), ("y", "<u2"), ("s", "<u4"), ("ns", "<u4"), ("p", "u1")])
+EVENT_2_BYTES = 16  # from one event of CDR to the next
+
+
+class Values:
+    """Numbers and texts of a message, one after the other.
+
+    A struct.error or ValueError means that the message ends too early.
+    """
+
+    def __init__(self, raw: bytes, is_ros1: bool) -> None:
+        """Begin with the first value; the four bytes before a message of CDR say its byte order."""
+        self.raw, self.is_ros1, self.place = raw, is_ros1, 0 if is_ros1 else 4
+        self._order = "<" if is_ros1 or raw[1:2] in (b"\1", b"\3") else ">"
+
+    def real(self, code: str) -> float:
+        """Return the next number by its code for `struct`; only in CDR there is a gap before it."""
+        size = struct.calcsize("<" + code)
+        if not self.is_ros1:
+            self.place += (4 - self.place) % size
+        value: float = struct.unpack_from(self._order + code, self.raw, self.place)[0]
+        self.place += size
+        return value
+
+    def number(self, code: str) -> int:
+        """Return the next whole number by its code for `struct`."""
+        return int(self.real(code))
+
+    def text(self) -> str:
+        """Return the next text."""
+        return self.bytes().rstrip(b"\0").decode("utf-8", "replace")
+
+    def bytes(self) -> bytes:
+        """Return the next list of bytes."""
+        size = self.number("I")
+        if size > len(self.raw) - self.place:
+            raise ValueError(f"a list of {size} bytes is not whole")
+        self.place += size
+        return self.raw[self.place - size : self.place]
+
+    def header(self) -> int:
+        """Return the time [us] of a header: a number (ROS 1), a time and the name of a frame."""
+        if self.is_ros1:
+            self.number("I")
+        seconds, nanoseconds = self.number("I"), self.number("I")
+        self.text()
+        return seconds * 1_000_000 + (nanoseconds + 500) // 1000
 
 
 def read_ros(request: Request) -> Opened:
@@ -36,8 +83,11 @@ def read_ros(request: Request) -> Opened:
         request.tally.damage[CUT] += sum(bag.path.stat().st_size for bag in bags)
         return Opened("ros", request, iter(()))
     topic = _chosen(request, topics)
-    size = _size(bags, topic.name)
-    return Opened("ros", request.sized(*size), _parts(request, bags, topic))
+    for _, first in _decoded(bags, topic):
+        if first is not None:
+            request = request.sized(first.width or None, first.height or None)
+            break
+    return Opened("ros", request, _parts(request, bags, topic))
 
 
 def _chosen(request: Request, topics: list[Topic]) -> Topic:
@@ -59,47 +109,72 @@ def _chosen(request: Request, topics: list[Topic]) -> Topic:
     return found[0]
 
 
-def _size(bags: list[Bag], topic: str) -> tuple[int | None, int | None]:
-    """Return the sensor's width and height by the first whole message."""
-    for bag in bags:
-        for message in messages(bag, {topic}):
-            decoded = _decoded(message, bag)
-            if decoded is not None:
-                return decoded.width or None, decoded.height or None
-    return None, None
-
-
 def _parts(request: Request, bags: list[Bag], topic: Topic) -> Iterator[Part]:
     """Yield the events of a topic."""
-    packets, arrays, size = PacketDecoder(request), [], 0
+    packets, size = PacketDecoder(request), 0
+    for message, decoded in _decoded(bags, topic):
+        if decoded is not None:
+            packets.add(decoded)
+        else:
+            request.tally.damage[CUT_PACKETS] += 1
+        size += len(message.raw) // MIN_BYTES
+        if size >= request.part_events:
+            yield packets.taken()
+            size = 0
+    yield packets.taken()
+
+
+def _decoded(bags: list[Bag], topic: Topic) -> Iterator[tuple[Message, EventArray | EventPacket | None]]:
+    """Yield the messages of a topic, and what each says; None: it is damaged."""
     for bag in bags:
         for message in messages(bag, {topic.name}):
-            decoded = _decoded(message, bag)
-            if isinstance(decoded, EventPacket):
-                packets.add(decoded)
-            elif decoded is not None:
-                arrays.append(decoded.columns)
+            values = Values(message.raw, bag.is_ros1)
+            try:
+                decoded = event_array(values) if message.kind in ARRAYS else event_packet(values)
+            except (struct.error, ValueError):
+                yield message, None
             else:
-                request.tally.damage[CUT_PACKETS] += 1
-            size += len(message.raw) // MIN_BYTES
-            if size >= request.part_events:
-                yield _part(request, packets, arrays)
-                arrays, size = [], 0
-    yield _part(request, packets, arrays)
+                yield message, decoded
 
 
-def _decoded(message: Message, bag: Bag) -> EventArray | EventPacket | None:
-    """Return what a message says, or None if it is damaged."""
-    try:
-        values = Values(message.raw, bag.is_ros1)
-        return event_array(values) if message.kind in ARRAYS else event_packet(values)
-    except (struct.error, ValueError):
-        return None
+def event_array(values: Values) -> EventArray:
+    """Return the events of a message."""
+    values.header()
+    height, width, count = values.number("I"), values.number("I"), values.number("I")
+    if values.is_ros1:
+        rows = np.frombuffer(values.raw, EVENT_1, count, values.place)
+    else:
+        rows = _rows_2(values, count)
+    seconds, nanoseconds, *others = (rows[name].astype(np.int64) for name in ("s", "ns", "x", "y", "p"))
+    t_us = seconds * 1_000_000 + (nanoseconds + 500) // 1000
+    return EventArray(width, height, np.stack((t_us, *others)))
 
 
-def _part(request: Request, packets: PacketDecoder, arrays: list[np.ndarray]) -> Part:
-    """Return the events of some messages."""
-    if arrays:
-        t_us, x, y, p = np.concatenate(arrays, axis=1)
-        return assemble(request, t_us, x, y, p)
-    return packets.taken()
+def event_packet(values: Values) -> EventPacket:
+    """Return a packet of bytes."""
+    values.header()
+    height, width = values.number("I"), values.number("I")
+    values.number("Q")  # which packet it is
+    base, encoding, is_big = values.number("Q"), values.text(), values.number("B")
+    if is_big:
+        raise ValueError("big-endian packets are not read")
+    return EventPacket(width, height, base, encoding, values.bytes())
+
+
+def _rows_2(values: Values, count: int) -> np.ndarray:
+    """Return the events of CDR as rows with the fields of `EVENT_1`.
+
+    The gaps of CDR leave x and y of all events but the first two bytes further ahead.
+    """
+    if not count:
+        return np.empty(0, EVENT_1)
+    size = EVENT_2_BYTES * count - 3
+    if size > len(values.raw) - values.place:
+        raise ValueError(f"a list of {count} events is not whole")
+    body = np.frombuffer(values.raw, np.uint8, size, values.place)
+    padded = np.zeros(EVENT_2_BYTES * (count + 1), np.uint8)
+    padded[2 : 2 + size] = body
+    padded[:4] = body[:4]  # x and y of the first
+    late = np.dtype({"names": ["x", "y", "s", "ns", "p"], "formats": ["<u2", "<u2", "<u4", "<u4", "u1"],
+                     "offsets": [0, 2, 6, 10, 14], "itemsize": EVENT_2_BYTES})  # fmt: skip
+    return np.frombuffer(padded.tobytes(), late, count)

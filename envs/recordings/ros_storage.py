@@ -1,20 +1,55 @@
 """Read the messages of ROS bags: ROS 1, and rosbag2 in db3 or mcap; also of bags that were cut off.
 
 Whole bags are read with the library rosbags (the extra `ros`). It reads no bag without its index, as a
-crashed recorder leaves it; such a bag is walked record by record (`ros_salvage`).
+crashed recorder leaves it; such a bag is walked record by record, by the descriptions of the bag format 2.0
+(wiki.ros.org/Bags/Format/2.0) and of MCAP (mcap.dev/spec). What is whole is read; the walk ends where the
+file does. It needs lz4 and zstd, which come with rosbags.
 """
 
+import bz2
+import contextlib
+import io
+import sqlite3
+import struct
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
-from envs.recordings import ros_salvage
 from envs.recordings.event_file import Request
-from envs.recordings.ros_salvage import Message, Topic
 
 MAGIC_BAG, MAGIC_DB3, MAGIC_MCAP = b"#ROSBAG V2.0", b"SQLite format 3\0", b"\x89MCAP0\r\n"
 STORAGE = (".db3", ".mcap")
+MAX_RECORD = 1 << 31
+BROKEN = (struct.error, sqlite3.Error, KeyError, EOFError, UnicodeDecodeError, OSError)  # of a walk
+
+
+class Topic(NamedTuple):
+    """A topic of a bag.
+
+    Attributes:
+        name: Such as "/dvs/events".
+        kind: Type of its messages, package/Name.
+        number: Number of messages; -1: not known.
+    """
+
+    name: str
+    kind: str
+    number: int
+
+
+class Message(NamedTuple):
+    """A message of a bag.
+
+    Attributes:
+        topic: Its topic.
+        kind: Its type.
+        raw: As it is serialized.
+    """
+
+    topic: str
+    kind: str
+    raw: bytes
 
 
 class Bag(NamedTuple):
@@ -47,32 +82,28 @@ def open_bags(request: Request) -> list[Bag]:
         ValueError: The library rosbags is missing, or there is no file in the folder.
     """
     path = request.path
-    _library(request)
     try:
-        return [_whole(path)]
-    except Exception:  # the library's errors have no common base, and salvage judges again
-        files = [path] if path.is_file() else sorted(one for one in path.iterdir() if one.suffix in STORAGE)
+        import rosbags  # noqa: F401
+    except ImportError:
+        raise request.refusal("is a ROS bag, which needs the library rosbags; pip install rosbags") from None
+    if bag := _whole(path):
+        return [bag]
+    files = [path] if path.is_file() else sorted(one for one in path.iterdir() if one.suffix in STORAGE)
     if not files:
         raise request.refusal(
             "is a folder without .db3 or .mcap files; give the folder or a file of a rosbag2"
-        ) from None
+        )
     if path.is_file() and not _magic(path).startswith((MAGIC_BAG, MAGIC_DB3, MAGIC_MCAP)):
-        raise request.refusal("is no ROS bag; give its format, or leave format out") from None
-    return [_whole_or_cut(one) for one in files]
-
-
-def _whole_or_cut(path: Path) -> Bag:
-    """Return one file as a bag, whole if it has its index."""
-    try:
-        return _whole(path)
-    except Exception:  # as above
-        return Bag(path, ros_salvage.topics(path), False, _is_ros1(path))
+        raise request.refusal("is no ROS bag; give its format, or leave format out")
+    return [_whole(one) or _cut(one) for one in files]
 
 
 def messages(bag: Bag, topics: set[str]) -> Iterator[Message]:
-    """Yield the messages of some topics, in the order of their recording."""
+    """Yield the whole messages of some topics, in the order of their recording."""
     if not bag.is_whole:
-        yield from ros_salvage.messages(bag.path, topics)
+        for item in _walk(bag.path):
+            if isinstance(item, Message) and item.topic in topics:
+                yield item
         return
     with _reader(bag.path) as reader:
         chosen = [one for one in reader.connections if one.topic in topics]
@@ -81,14 +112,23 @@ def messages(bag: Bag, topics: set[str]) -> Iterator[Message]:
                 yield Message(connection.topic, _kind(connection.msgtype), bytes(raw))
 
 
-def _whole(path: Path) -> Bag:
-    """Return a bag as the library opens it."""
-    with _reader(path) as reader:
-        counts = Counter[tuple[str, str]]()
-        for one in reader.connections:
-            counts[one.topic, _kind(one.msgtype)] += one.msgcount
+def _whole(path: Path) -> Bag | None:
+    """Return a bag as the library opens it, or None if it does not."""
+    try:
+        with _reader(path) as reader:
+            counts = Counter[tuple[str, str]]()
+            for one in reader.connections:
+                counts[one.topic, _kind(one.msgtype)] += one.msgcount
+    except Exception:  # the library's errors have no common base, and the walk judges again
+        return None
     topics = [Topic(name, kind, count) for (name, kind), count in counts.items()]
     return Bag(path, topics, True, _is_ros1(path))
+
+
+def _cut(path: Path) -> Bag:
+    """Return a bag without an index."""
+    topics = list(dict.fromkeys(item for item in _walk(path) if isinstance(item, Topic)))
+    return Bag(path, topics, False, _is_ros1(path))
 
 
 def _reader(path: Path) -> Any:
@@ -115,9 +155,133 @@ def _kind(name: str) -> str:
     return name.replace("/msg/", "/")
 
 
-def _library(request: Request) -> None:
-    """Refuse a bag if the library is not installed."""
-    try:
-        import rosbags  # noqa: F401
-    except ImportError:
-        raise request.refusal("is a ROS bag, which needs the library rosbags; pip install rosbags") from None
+def _walk(path: Path) -> Iterator[Topic | Message]:
+    """Yield topics and messages in the order of the file, until it ends or makes no sense."""
+    magic, size = _magic(path), path.stat().st_size
+    with contextlib.suppress(*BROKEN), path.open("rb") as file:
+        if magic.startswith(MAGIC_BAG):
+            file.readline()
+            yield from _walk_bag(file, size, {})
+        elif magic.startswith(MAGIC_MCAP):
+            file.seek(len(MAGIC_MCAP))
+            yield from _walk_mcap(file, size, {}, {0: ""})
+        else:
+            yield from _walk_db3(path)
+
+
+def _walk_bag(
+    file: BinaryIO, most: int, known: dict[bytes, Topic], is_chunk: bool = False
+) -> Iterator[Topic | Message]:
+    """Walk through the records of a bag of ROS 1, or of one of its chunks.
+
+    At most `most` bytes are read at once: memory for a damaged size would be taken before.
+    """
+    while len(size := file.read(4)) == 4:
+        (length,) = struct.unpack("<I", size)
+        head = file.read(min(length, most))
+        if length > MAX_RECORD or len(head) < length:
+            return
+        header = _split(head)
+        (length,) = struct.unpack("<I", file.read(4))
+        if length > MAX_RECORD:
+            return
+        data = file.read(min(length, most))
+        if header.get(b"op") == b"\x05" and not is_chunk:  # a chunk, which may have been cut off
+            chunk = _unpacked(data, header[b"compression"].decode())
+            yield from _walk_bag(io.BytesIO(chunk), len(chunk), known, True)
+        elif len(data) == length:
+            yield from _bag_record(header, data, known)
+
+
+def _bag_record(
+    header: dict[bytes, bytes], data: bytes, known: dict[bytes, Topic]
+) -> Iterator[Topic | Message]:
+    """Yield what a record of a connection or a message says."""
+    if header.get(b"op") == b"\x07":
+        facts = _split(data)
+        known[header[b"conn"]] = Topic(header[b"topic"].decode(), facts[b"type"].decode(), -1)
+        yield known[header[b"conn"]]
+    if header.get(b"op") == b"\x02" and header[b"conn"] in known:
+        topic = known[header[b"conn"]]
+        yield Message(topic.name, topic.kind, data)
+
+
+def _split(head: bytes) -> dict[bytes, bytes]:
+    """Return the fields of a header: their length, then name=value."""
+    fields, place = {}, 0
+    while place < len(head):
+        (size,) = struct.unpack_from("<I", head, place)
+        name, _, value = head[place + 4 : place + 4 + size].partition(b"=")
+        fields[name] = value
+        place += 4 + size
+    return fields
+
+
+def _walk_mcap(
+    file: BinaryIO, most: int, known: dict[int, Topic], kinds: dict[int, str], is_chunk: bool = False
+) -> Iterator[Topic | Message]:
+    """Walk through the records of an mcap file, or of one of its chunks; `most` as in `_walk_bag`."""
+    while len(head := file.read(9)) == 9:
+        code, size = struct.unpack("<BQ", head)
+        if code == 0 or size > MAX_RECORD:
+            return
+        data = file.read(min(size, most))
+        if code == 6 and not is_chunk:  # a chunk, which may have been cut off
+            compression, place = _text(data, 28)
+            chunk = _unpacked(data[place + 8 :], compression)
+            yield from _walk_mcap(io.BytesIO(chunk), len(chunk), known, kinds, True)
+        elif len(data) == size:
+            yield from _mcap_record(code, data, known, kinds)
+
+
+def _mcap_record(
+    code: int, data: bytes, known: dict[int, Topic], kinds: dict[int, str]
+) -> Iterator[Topic | Message]:
+    """Yield what a record of a schema, a channel or a message says."""
+    if code == 3:
+        (number,) = struct.unpack_from("<H", data)
+        kinds[number] = _kind(_text(data, 2)[0])
+    elif code == 4:
+        number, schema = struct.unpack_from("<HH", data)
+        known[number] = Topic(_text(data, 4)[0], kinds.get(schema, ""), -1)
+        yield known[number]
+    elif code == 5:
+        (number,) = struct.unpack_from("<H", data)
+        if number in known:
+            yield Message(known[number].name, known[number].kind, data[22:])
+
+
+def _text(data: bytes, place: int) -> tuple[str, int]:
+    """Return a text after its length, and the place behind it."""
+    (size,) = struct.unpack_from("<I", data, place)
+    return data[place + 4 : place + 4 + size].decode(), place + 4 + size
+
+
+def _walk_db3(path: Path) -> Iterator[Topic | Message]:
+    """Walk through a database, row by row until one is damaged."""
+    with contextlib.closing(sqlite3.connect(f"file:{path}?mode=ro&immutable=1", uri=True)) as database:
+        rows = database.execute("SELECT id, name, type FROM topics").fetchall()
+        known = {number: Topic(name, _kind(kind), -1) for number, name, kind in rows}
+        yield from known.values()
+        for number, raw in database.execute("SELECT topic_id, data FROM messages"):
+            if number in known:
+                yield Message(known[number].name, known[number].kind, raw)
+
+
+def _unpacked(data: bytes, compression: str) -> bytes:
+    """Return what can be unpacked of a chunk."""
+    if compression in ("", "none"):
+        return data
+    unpack: Any
+    if compression == "bz2":
+        unpack = bz2.BZ2Decompressor()
+    elif compression == "lz4":
+        import lz4.frame
+
+        unpack = lz4.frame.LZ4FrameDecompressor()
+    else:
+        from backports import zstd
+
+        unpack = zstd.ZstdDecompressor()
+    unpacked: bytes = unpack.decompress(data)
+    return unpacked

@@ -1,4 +1,4 @@
-"""Read text and CSV files of events, one event a line."""
+"""Read and write text and CSV files of events, one event a line."""
 
 import contextlib
 import io
@@ -6,11 +6,13 @@ import re
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from itertools import chain, islice
+from pathlib import Path
 from typing import IO, NamedTuple
 
 import numpy as np
 
-from envs.recordings.event_file import CUT_LINE, Opened, Part, Request, assemble
+from core.files import replaced
+from envs.recordings.event_file import CUT_LINE, Append, Opened, Part, Request, assemble, chunks
 from envs.recordings.names import COLUMNS, microseconds, roles
 
 E2VID = {"columns": "t x y p", "usual_unit": "s"}  # after a first line with the sensor's size
@@ -139,13 +141,12 @@ def _is_whole(line: str, table: Table, columns: list[int]) -> bool:
 @contextlib.contextmanager
 def _refusing(request: Request) -> Iterator[None]:
     """Turn errors of numpy and of the decoder into a refusal of the file."""
-    with request.refusing((ValueError,), "has a line that is no row of numbers ({}); repair or remove it"):
-        try:
-            yield
-        except UnicodeDecodeError as error:
-            raise request.refusal(
-                f"is not UTF-8 text ({error.reason} at byte {error.start}); give the format"
-            ) from None
+    rows, text = "has a line that is no row of numbers ({}); repair or remove it", (UnicodeDecodeError,)
+    with (
+        request.refusing((ValueError,), rows),
+        request.refusing(text, "is not UTF-8 text ({}); give the format"),
+    ):
+        yield
 
 
 def _check_lines(request: Request, open_bytes: Callable[[], IO[bytes]]) -> None:
@@ -197,3 +198,22 @@ def _facts(text: str) -> dict[str, str]:
     if name.lower() in ("columns", "time_unit", "width", "height"):
         return {name.lower(): value.replace(",", " ").strip()}
     return {}
+
+
+@contextlib.contextmanager
+def text_writer(path: Path, width: int, height: int, separator: str = " ") -> Iterator[Append]:
+    """Yield a function that adds lines, under lines that say columns, unit, polarity code and sensor.
+
+    Separated by commas the first line names the columns and no other is there: what opens CSV
+    knows no comments. The sensor's size is not in such a file.
+    """
+    about = f"# time_unit: us\n# polarity: -1 is OFF (darker), 1 is ON (brighter)\n# width: {width}\n"
+    about += f"# height: {height}\n# columns: t x y p\n"
+    with replaced(path) as part, part.open("w", encoding="ascii", newline="\n") as file:
+        file.write("t_us,x,y,p\n" if separator == "," else about)
+
+        def append(events: np.ndarray, _: np.ndarray | None) -> None:
+            for some in chunks(events):
+                file.writelines(separator.join(map(str, row)) + "\n" for row in some.tolist())
+
+        yield append

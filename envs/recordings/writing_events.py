@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from envs.events import EVENT
-from envs.recordings.event_file import check_events
+from envs.recordings.event_file import Append, check_events
 from envs.recordings.formats import LABELLED, TABLE, WRITERS, WRITTEN_SUFFIXES
-from envs.recordings.writing import Append
 
 Write = Callable[..., None]
 

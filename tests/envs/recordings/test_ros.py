@@ -8,8 +8,7 @@ import pytest
 from envs.recordings import read_events, read_frames, read_imu, read_parts
 from envs.recordings.event_file import CUT_PACKETS, Request, Tally
 from envs.recordings.event_packets import ROWS as DECODERS
-from envs.recordings.event_packets import PacketDecoder
-from envs.recordings.ros_messages import EventPacket
+from envs.recordings.event_packets import EventPacket, PacketDecoder
 from tests.support.event_files import some_events
 
 pytest.importorskip("rosbags", reason="the package rosbags reads and writes bags")
