@@ -27,7 +27,7 @@ from jobs.study.axis_figure import axis_figure
 from jobs.study.computed import Study, compute
 from jobs.study.page import FOUND_MET, figures, part
 from jobs.study.plan import Plan
-from jobs.study.results import Condition, Results, write_cells
+from jobs.study.results import Condition, Results, texts_of, write_cells
 from jobs.study.summaries import (
     Summary,
     axis_curves,
@@ -146,23 +146,18 @@ def facts_of(folder: Run, found: Evaluated) -> dict[str, Any]:
                  for axis, points in plan.axes.items()},
         "exactness": _exactness(found),
         "compared": [_compared(plan, at) for at in plan.conditions],
-        "met": sorted([*_place(at), group] for at, group in plan.met),
+        "met": sorted([*texts_of(at), group] for at, group in plan.met),
         "seeds": study.seeds,
         "env_steps": config.train.env_steps,
         "variants": {name: dict(changes) for name, changes in study.variants.items()},
     }  # fmt: skip
 
 
-def _place(at: Condition) -> list[str]:
-    """Return a condition as files have it."""
-    return [at[0], text_of(at[1])]
-
-
 def _compared(plan: Plan, at: Condition) -> dict[str, Any]:
     """Return what a condition is compared with, and the first one that is the same simulation."""
     usual = plan.baselines[at]
-    one = {"condition": _place(at), "baseline": _place(usual), "same_as": _place(plan.same_as[at])}
-    own = {group: _place(found[at]) for group, found in plan.own_baselines.items() if found[at] != usual}
+    one = {"condition": texts_of(at), "baseline": texts_of(usual), "same_as": texts_of(plan.same_as[at])}
+    own = {group: texts_of(found[at]) for group, found in plan.own_baselines.items() if found[at] != usual}
     return {**one, "own_baseline": own} if own else one
 
 
@@ -170,7 +165,7 @@ def _exactness(found: Evaluated) -> list[dict[str, Any]]:
     """Return how exact each condition was simulated: asked and achieved, as far as it was measured."""
     first = {task.condition: task for task in reversed(found.plan.tasks)}
     return [
-        {"condition": _place(at), "asked": task.env.fidelity.tolerance, **asdict(accuracy)}
+        {"condition": texts_of(at), "asked": task.env.fidelity.tolerance, **asdict(accuracy)}
         for at, task in ((at, first[at]) for at in found.plan.conditions)
         if (accuracy := found.store.accuracy(task)) is not None
     ]
@@ -229,7 +224,7 @@ def write_tables(
         text += "\nMinutes of a training, without its encoder: "
         text += f"{', '.join(f'{name} {value:.1f}' for name, value in times.items())}.\n"
     if failed:
-        labels = {(*_place(task.condition), task.policy.group, _seed_text(task)): found.failed[task.key]
+        labels = {(*texts_of(task.condition), task.policy.group, _seed_text(task)): found.failed[task.key]
                   for task in failed}  # fmt: skip
         reasons = sorted((*label, reason) for label, reason in labels.items())
         table = markdown_table((*LABELS, "Reason"), reasons, 5)
@@ -258,7 +253,7 @@ def _seed_text(task: EvaluationTask) -> str:
 
 def condition_run(found: Evaluated, one: Summary) -> ChildRun:
     """Return the child run of a group under one condition; a tag says what of it could not be evaluated."""
-    axis, value = _place(one.condition)
+    axis, value = texts_of(one.condition)
     tasks = found.by_cell[one.condition, one.group]
     seeds = ", ".join("-" if seed is None else str(seed) for seed in one.trainings)
     rate = estimate_text(one.success, 100, ".0f")

@@ -223,7 +223,8 @@ def joined(earlier: Results, more: Results) -> Results:
         "variants": {**variants, **more_variants},
         "seeds": sorted({*one.get("seeds", ()), *other.get("seeds", ())}),
         "evaluated_at": sorted({*one["evaluated_at"], *other["evaluated_at"]}),
-        "exactness": one["exactness"],
+        "exactness": one.get("exactness", []),
+        "compared": _compared_in_both(earlier, more),
         "earlier": [*one.get("earlier", ()), {name: one[name] for name in MADE}],
     }
     cells = {
@@ -232,6 +233,24 @@ def joined(earlier: Results, more: Results) -> Results:
         for at in earlier.conditions
     }
     return Results(facts, cells)
+
+
+def _compared_in_both(earlier: Results, more: Results) -> list[dict[str, Any]]:
+    """Return what each condition is compared with, of the groups of two runs, as the facts have it."""
+    found = []
+    for at in earlier.conditions:
+        usual = more.baselines()[at]
+        each = {name: run.baselines(name)[at] for run in (earlier, more) for name in run.groups}
+        same = more.same_as[at] if more.same_as[at] == earlier.same_as[at] else at
+        own = {name: texts_of(other) for name, other in each.items() if other != usual}
+        entry = {"condition": texts_of(at), "baseline": texts_of(usual), "same_as": texts_of(same)}
+        found.append({**entry, "own_baseline": own} if own else entry)
+    return found
+
+
+def texts_of(at: Condition) -> list[str]:
+    """Return a condition as files have it."""
+    return [at[0], text_of(at[1])]
 
 
 def publish(data: Path, name: str, results: Results) -> None:

@@ -163,3 +163,32 @@ def test_runs_that_differ_or_share_a_training_are_not_joined(seeds, changed, nam
     earlier, more = only(Results(facts, whole.cells), {0, 1, 2}), only(whole, seeds)
     with pytest.raises(ConfigError, match=rf"report\.keep: .*{named}"):
         joined(earlier, Results({**more.facts, **changed}, more.cells))
+
+
+def test_each_group_of_a_joined_study_keeps_what_it_is_compared_with():
+    whole = read_published(DATA, "body_conditions")
+    at, nominal = ("control_hz_dense", 25.0), whole.nominal
+    dense = ("control_hz_dense", 200.0)
+    first = only_groups(whole, {"body_hold"}, dense, nominal)
+    second = only_groups(whole, {"oracle"}, nominal, nominal)
+    for earlier, more in ((first, second), (second, first)):
+        both = joined(earlier, more)
+        assert both.baselines("body_hold")[at] == dense
+        assert both.baselines("oracle")[at] == nominal
+        assert both.baselines("oracle").keys() == set(whole.conditions)
+
+
+def only_groups(results, names, baseline, nominal):
+    """The episodes of these groups, of which the denser conditions are compared with `baseline`."""
+    texts = {one: [one[0], tasks.text_of(one[1])] for one in results.conditions}
+    compared = [
+        {
+            "condition": texts[one],
+            "baseline": texts[baseline if one[0] == baseline[0] else nominal],
+            "same_as": texts[one],
+        }
+        for one in results.conditions
+    ]
+    groups = {name: own for name, own in results.groups.items() if name in names}
+    cells = {at: own for at, own in results.cells.items() if at[1] in names}
+    return Results({**results.facts, "groups": groups, "compared": compared}, cells)
