@@ -332,9 +332,11 @@ def packed(network: nn.Module) -> nn.Module:
 
     Other parts are the same objects. It runs on the processor.
     """
-    if isinstance(network, Linear) and network.weight.dtype == torch.float32:
+    if type(network) is Linear and network.weight.dtype == torch.float32:
         return PackedLinear(network)
-    return nn.Sequential(*map(packed, network)) if isinstance(network, nn.Sequential) else network
+    if type(network) is nn.Sequential:  # a class of its own may compute otherwise
+        return nn.Sequential(*map(packed, network))
+    return network
 
 
 def orthogonal_(weight: Tensor, gain: float, generator: torch.Generator | None = None) -> None:

@@ -156,6 +156,10 @@ def test_packed_dense_layers_have_the_bytes_of_plain_ones(inputs, outputs):
     assert own(given).numpy().tobytes() == expected.numpy().tobytes()  # by the weights of that moment
     double = Linear(2, 3).double()
     assert packed(double) is double
+    other = type("Twice", (torch.nn.Sequential,), {"forward": lambda self, given: 2 * self[0](given)})(
+        Linear(2, 3)
+    )
+    assert packed(other) is other
 
 
 def test_a_dot_and_sums_of_rows_are_exact_where_nothing_is_rounded():
