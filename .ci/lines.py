@@ -1,7 +1,7 @@
-"""Count lines of code: those that hold a token, without docstrings, comments and blank lines.
+"""Count lines of code: lines with a token, without docstrings, comments and blank lines.
 
 Run: python .ci/lines.py (make lines)
-Expect: lines and files of each room of the product, of the product, and of the rooms outside the wheel.
+Expect: lines and files of each package of the product, of the whole product, and outside the wheel.
 """
 
 import ast
@@ -34,7 +34,7 @@ def code_lines(source: str) -> int:
 
 
 def _docstring_lines(tree: ast.AST) -> set[int]:
-    """Return the lines of all docstrings, and of the strings that document a name below it."""
+    """Return the lines of all docstrings, including strings that document an attribute above them."""
     lines: set[int] = set()
     for node in ast.walk(tree):
         if (
@@ -47,7 +47,7 @@ def _docstring_lines(tree: ast.AST) -> set[int]:
 
 
 def main() -> None:
-    """Print lines and files of each room."""
+    """Print the table of lines and files."""
     command = ["git", "ls-files", "*.py"]
     tracked = subprocess.check_output(command, cwd=ROOT, text=True).splitlines()
     lines, files = Counter[str](), Counter[str]()

@@ -1,12 +1,12 @@
-"""Speed and event error of a control step, of this checkout against another commit, in one interleaved run.
+"""Compare speed and event error of a control step in this checkout and another commit, in interleaved rounds.
 
-Run: python -m benchmarks.against [COMMIT [SCENE ...]], the one before HEAD unless another is named
-Expect: a table in about five minutes on one core. Two processes, one of each checkout, take turns
-at the same flights, 32 corridors side by side; a ratio is the median over the rounds of the other's
-time over this one's. The event error is that against the converged simulation of the same checkout,
+Run: python -m benchmarks.against [COMMIT [SCENE ...]]; COMMIT is the one before HEAD by default
+Expect: a table in about five minutes on one core. Two processes, one per checkout, take turns
+at the same flights in 32 parallel corridors. A ratio is the median over the rounds of the other checkout's
+time divided by this one's. The event error is relative to the converged simulation of the same checkout,
 at tolerance 0.05. By day and night the pixels have bandwidth and mismatch, but no noise. In the last row
-a shipped policy also encodes the windows and decides. Rows that the other commit cannot do are left out.
-Below it stands the memory of a process that does what the last row does, without the converged simulation.
+a shipped policy also encodes the windows and decides. Rows that the other commit does not support are left
+out. Below the table is the memory of a process that does the last row without the converged simulation.
 """
 
 import inspect
@@ -26,7 +26,7 @@ ROUNDS, CORRIDORS, STEPS = 15, 32, 12
 SCENES = ("poles", "poles_dense", "shape_change", "gates", "texture_change", "dynamic")
 ROOT = Path(__file__).resolve().parents[1]
 DECIDED = "poles models/pretrained/bytestream-s0"
-NAMES = {  # of rows that are not a scene alone
+NAMES = {  # of rows that are more than a scene
     "poles 300 0.15": "poles, pixels of light=day",
     "poles 30 0.25": "poles, pixels of light=night",
     DECIDED: "poles, encoded and decided",
@@ -34,7 +34,7 @@ NAMES = {  # of rows that are not a scene alone
 
 
 def prepare(scene: str, slow: list[float], folder: list[str]) -> tuple | None:
-    """The corridors, the policy (or None) and the event error of one row; None: this commit cannot do it."""
+    """Return corridors, policy (or None) and event error of a row; None if this commit cannot run it."""
     from envs.config import CameraConfig, EnvConfig
     from envs.corridor import CorridorVectorEnv
     from envs.event_error import measure_event_error
@@ -44,7 +44,7 @@ def prepare(scene: str, slow: list[float], folder: list[str]) -> tuple | None:
     try:
         if slow:
             camera = CameraConfig(cutoff_hz=slow[0], threshold_mismatch=slow[1])
-    except (TypeError, ValueError):  # of a commit that has no such camera
+    except (TypeError, ValueError):  # raised by a commit without such a camera
         return None
     env = CorridorVectorEnv(CORRIDORS, EnvConfig(scene=scene, camera=camera, window_capacity=1024))
     env.reset(seed=0)
@@ -55,12 +55,12 @@ def prepare(scene: str, slow: list[float], folder: list[str]) -> tuple | None:
 
 
 def worker() -> None:
-    """Answer each line of the input by seconds a step and the event error, as JSON.
+    """Answer each line of the input with seconds per step and the event error, as JSON.
 
-    A line is the name of a scene, bandwidth [Hz] and mismatch of the pixels, and the folder of a policy
-    if one is to decide at each step.
-    It runs by its source and that of `prepare` alone in another checkout, so that it takes nothing else
-    from this file.
+    A line has the name of a scene, optionally bandwidth [Hz] and mismatch of the pixels, and optionally the
+    folder of a policy that decides at each step.
+    In another checkout only its source and the source of `prepare` run, so it uses nothing else from
+    this file.
     """
     import json
     import sys
@@ -93,9 +93,9 @@ def worker() -> None:
 
 
 def fly_alone() -> None:
-    """Fly, encode and decide 200 steps, and print the most memory that this process ever held [MB].
+    """Fly, encode and decide 200 steps, and print the peak memory of this process [MB].
 
-    It runs by its source alone in another checkout, as `worker` does.
+    In another checkout only its source runs, as for `worker`.
     """
     import resource
 
@@ -119,11 +119,11 @@ def fly_alone() -> None:
 
 
 def memory(folder: Path) -> float:
-    """MB of a process that flies by a checkout, once its kernels are compiled."""
+    """Return the peak memory [MB] of a process that flies with a checkout's compiled kernels."""
     code = "\n".join((f"CORRIDORS = {CORRIDORS}", inspect.getsource(fly_alone), "fly_alone()"))
     environment = {**os.environ, "PYTHONPATH": str(folder)}
     command = [sys.executable, "-c", code]
-    for _ in range(2):  # the first compiles, which takes memory
+    for _ in range(2):  # the first run compiles, which takes memory
         said = subprocess.check_output(command, cwd=folder, env=environment, text=True)  # noqa: S603  own code
     return float(said)
 
@@ -132,7 +132,7 @@ class Checkout:
     """A process that flies with the code of one checkout."""
 
     def __init__(self, folder: Path) -> None:
-        """Start it."""
+        """Start the process."""
         numbers = f"CORRIDORS, STEPS = {CORRIDORS}, {STEPS}"
         code = "\n".join((numbers, inspect.getsource(prepare), inspect.getsource(worker), "worker()"))
         environment = {**os.environ, "PYTHONPATH": str(folder)}
@@ -146,7 +146,7 @@ class Checkout:
         )
 
     def fly(self, scene: str) -> tuple[float, float] | None:
-        """Median seconds of a step, and the event error; None: this checkout cannot do it."""
+        """Return the median time of a step [s] and the event error; None if the checkout cannot run it."""
         assert self._process.stdin is not None  # noqa: S101  for the type checker
         assert self._process.stdout is not None  # noqa: S101
         self._process.stdin.write(f"{scene}\n")
@@ -155,14 +155,14 @@ class Checkout:
         return None if found is None else (found[0], found[1])
 
     def end(self) -> None:
-        """Stop it."""
+        """Stop the process."""
         self._process.kill()
         self._process.wait()
 
 
 @contextmanager
 def checked_out(commit: str) -> Iterator[Path]:
-    """A folder with the code of a commit of this repository."""
+    """Yield a folder with the code of a commit of this repository."""
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder) / "code"
         git = ["git", "-C", str(ROOT), "worktree"]
@@ -174,7 +174,7 @@ def checked_out(commit: str) -> Iterator[Path]:
 
 
 def compared(scene: str, here: Checkout, there: Checkout) -> list[tuple[str, ...]]:
-    """The row of the table, if both can do it; the first round, which compiles, does not count."""
+    """Return the row of a scene, if both checkouts can run it; ignore the first round, which compiles."""
     rounds = [(here.fly(scene), there.fly(scene)) for _ in range(ROUNDS + 1)]
     pairs = [(own, other) for own, other in rounds[1:] if own is not None and other is not None]
     if not pairs:

@@ -1,10 +1,10 @@
-"""What a control step costs under each condition of the sweep, and so what the sweep pays for.
+"""Measure the cost of a control step under each condition of the sweep, and its share of the whole sweep.
 
 Run: OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 python -m benchmarks.conditions
-Expect: a table in about five minutes, of one core: processor time of a control step and corridor with its
-events, without any policy, 7 corridors side by side, drawn actions, medians of rounds that take turns;
-and its share, if each condition takes as many seconds of simulated time. Conditions that are the same
-simulation stand once.
+Expect: a table in about five minutes on one core: CPU time per control step and corridor with its
+events, without a policy, in 7 parallel corridors with random actions; medians of interleaved rounds.
+The share assumes the same simulated time for each condition. Conditions with the same simulation
+are listed once.
 """
 
 import time
@@ -22,7 +22,7 @@ from jobs.config.env_keys import env_with
 from jobs.measure.timing import interleaved
 from jobs.rollout.tasks import text_of
 
-CORRIDORS = 7  # of a training and condition of the sweep
+CORRIDORS = 7  # per training and condition of the sweep
 SIMULATED_S = 0.5  # of each round
 ROUNDS = 3
 
@@ -42,7 +42,7 @@ def main() -> None:
 
 
 def conditions_of_sweep() -> dict[str, EnvConfig]:
-    """Name -> environment of each condition of conf/exp/robustness.yaml that is a simulation of its own."""
+    """Return name -> environment of each condition of conf/exp/robustness.yaml, each simulation once."""
     config = composed("+exp=robustness")
     nominal = replace(config.env, scene=config.own.scene, split="eval", window_capacity=None)
     found = {"nothing changed": nominal}
@@ -55,7 +55,7 @@ def conditions_of_sweep() -> dict[str, EnvConfig]:
 
 
 def stepping(config: EnvConfig) -> Callable[[], object]:
-    """Steps some corridors from their beginning, the same ones and by the same actions each time."""
+    """Return a function that steps the same corridors from the start, with the same actions at each call."""
     env = CorridorVectorEnv(CORRIDORS, config)
 
     def run() -> None:

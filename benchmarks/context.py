@@ -1,11 +1,10 @@
-"""Training step of the event VAE: fused context network against the plain formula, and two threads.
+"""Compare training steps of the event VAE: fused or plain context network, and one thread or two.
 
 Run `OMP_NUM_THREADS=1 OMP_WAIT_POLICY=PASSIVE python -m benchmarks.context [repeats]` from the repository
-root; it prints as JSON CPU seconds per training step of both forms, measured in turn in one process, and
-their ratio; then seconds per step with one thread and with two, in turn, which need two idle cores. The plain
-form's tensors of 400 MB are otherwise fetched page by page from the system in every step, which doubles its
-time; to give it reused memory, set also `MALLOC_MMAP_MAX_=0 MALLOC_TRIM_THRESHOLD_=100000000000
-MALLOC_TOP_PAD_=1000000000` (glibc).
+root; it prints as JSON the CPU seconds per training step of both forms, interleaved in one process, and their
+ratio; then seconds per step with one thread and with two, interleaved, which need two idle cores. The system
+maps the plain form's tensors of 400 MB page by page in every step, which doubles its time. To reuse memory,
+also set `MALLOC_MMAP_MAX_=0 MALLOC_TRIM_THRESHOLD_=100000000000 MALLOC_TOP_PAD_=1000000000` (glibc).
 """
 
 import json
@@ -21,7 +20,7 @@ from models.encoder.event_batch import EventBatch
 
 
 def random_batch(evae: EventVAE, windows: int, events: int, rng: np.random.Generator) -> EventBatch:
-    """`windows` windows of `events` uniform events each, sorted by time."""
+    """Return `windows` windows of `events` uniform events each, sorted by time."""
     grid, total = evae.grid, windows * events
     code = rng.integers(0, 2 * grid.width * grid.height, total, dtype=np.int32)
     bins = np.sort(rng.integers(0, grid.time_bins, (windows, events), dtype=np.int32)).ravel()
@@ -29,7 +28,7 @@ def random_batch(evae: EventVAE, windows: int, events: int, rng: np.random.Gener
 
 
 def compare(variant: str, windows: int = 50, events: int = 2000, repeats: int = 3) -> dict[str, float]:
-    """CPU seconds of one update, both forms, at the appendix's batch (B.2: 50 x 2000) and one thread.
+    """Return CPU seconds of one update of both forms, at the appendix's batch (B.2: 50 x 2000), one thread.
 
     Args:
         variant: "bytestream" or "bytestream_xy".
@@ -67,7 +66,7 @@ def compare(variant: str, windows: int = 50, events: int = 2000, repeats: int = 
 
 
 def compare_threads(windows: int = 50, events: int = 2000, repeats: int = 20) -> dict[str, float]:
-    """Seconds of one update of the fused form with one thread and with two; arguments as in `compare`.
+    """Return seconds of one update of the fused form, with one and two threads; arguments as in `compare`.
 
     Returns:
         one_s, two_s (medians), ratio of the medians.
@@ -90,7 +89,7 @@ def compare_threads(windows: int = 50, events: int = 2000, repeats: int = 20) ->
 
 
 def seconds(call: Callable[[], None]) -> float:
-    """CPU time of one call (user and system), which other processes disturb least."""
+    """Return the CPU time of one call [s] (user and system), which other processes disturb least."""
     start = time.process_time()
     call()
     return time.process_time() - start

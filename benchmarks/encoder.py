@@ -1,18 +1,18 @@
-"""Encoding of events: lookup table against the network, plain torch, and merely reading the rows.
+"""Compare the encoder's lookup table with its network, with plain torch, and with only reading the rows.
 
 Run `OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 python -m benchmarks.encoder [rounds]` from the
-repository root. CPU time on one core, medians of rounds that take turns in one process; the events are
+repository root. CPU time on one core, medians of interleaved rounds in one process; the events are
 uniform, which is the worst case for caches. It prints as JSON
 
-- `codings`: for each coding of time, at the paper's sizes, microseconds per window of 300 and
-  2,000 events by the table, second half of the encoder included; how many times longer the network takes
-  for 2,000; nanoseconds per event; and those as a multiple of `np.copyto` of the bytes that an event
-  reads (a row of features and one of time code);
-- `rows`: for each precision, and 256 and 1,024 features, the same for 2,000 events, how many times longer
-  plain torch takes for the context alone (Conv1d 3-64-128-features, batch norm, ReLU, maximum), and
-  nanoseconds per event as a multiple of only loading the same words of the same rows;
+- `codings`: for each coding of time, at the paper's sizes: microseconds per window of 300 and of
+  2,000 events by the table, including the second half of the encoder; how many times longer the network takes
+  for 2,000 events; nanoseconds per event; and the time per event relative to `np.copyto` of the bytes that an
+  event reads (a row of features and a row of the time code);
+- `rows`: for each precision, and 256 and 1,024 features: the same for 2,000 events; how many times longer
+  plain torch takes for the context alone (Conv1d 3-64-128-features, batch norm, ReLU, maximum); and the
+  time per event relative to only loading the same words of the same rows;
 - `batch_us_per_window`: 32 windows of 20 to 280 events and 256 features, in one call and one by one;
-- `neighbour_filter_ns_per_event`: of `core.neighbour_filter`, at 64 x 64 pixels.
+- `neighbour_filter_ns_per_event`: time of `core.neighbour_filter`, at 64 x 64 pixels.
 """
 
 import itertools
@@ -38,13 +38,13 @@ from models.encoder.event_batch import batch_windows
 from models.encoder.table import PRECISIONS, EncoderTable
 
 FEW, MANY, WINDOW_US = 300, 2000, 20_000
-CALLS = 20  # of what is short, in each round
-PART = 50  # events whose rows are copied at once, to where the cache holds them
+CALLS = 20  # of short functions, in each round
+PART = 50  # events whose rows are copied at once, to a target that stays in the cache
 CORRIDORS, SIDE, TAU_US = 32, 64, 2000
 
 
 def compare(coding: str, rounds: int = 15) -> dict[str, float]:
-    """Times of one coding, at the paper's sizes."""
+    """Return the times of one coding, at the paper's sizes."""
     torch.manual_seed(0)
     evae = EventVAE(coding=coding).freeze()
     table, network = EncoderTable.from_evae(evae), encode_by_network(evae)
@@ -72,7 +72,7 @@ def compare(coding: str, rounds: int = 15) -> dict[str, float]:
 
 
 def compare_rows(features: int, precision: str, rounds: int) -> dict[str, float]:
-    """Times of rows of so many features and this precision."""
+    """Return the times of rows with `features` features and a precision."""
     torch.manual_seed(0)
     table = EncoderTable.from_evae(EventVAE(context=features).freeze(), precision)
     many, none = uniform_window(MANY), uniform_window(0)
@@ -98,7 +98,7 @@ def compare_rows(features: int, precision: str, rounds: int) -> dict[str, float]
 
 
 def compare_batch(rounds: int) -> dict[str, float]:
-    """Microseconds per packed window of a batch, at once and one by one."""
+    """Return microseconds per packed window of a batch, in one call and one by one."""
     table = EncoderTable.from_evae(EventVAE(context=256, latent=32).freeze())
     counts = np.linspace(20, 280, CORRIDORS).astype(int)
     windows = [pack_window(*uniform_window(count), capacity=count) for count in counts]
@@ -115,7 +115,7 @@ def compare_batch(rounds: int) -> dict[str, float]:
 
 
 def filter_cost(support: int, rounds: int) -> float:
-    """Nanoseconds per event of the neighbour filter."""
+    """Return the neighbour filter's time per event [ns]."""
     (events, _, _), last_us = uniform_window(MANY), quiet_sensor(SIDE, SIDE)
     seconds = medians({"": lambda: filter_neighbours(events, last_us, support, TAU_US)}, {}, rounds)
     return 1e9 * seconds[""] / MANY
@@ -124,7 +124,7 @@ def filter_cost(support: int, rounds: int) -> float:
 def medians(
     short: dict[str, Callable[[], object]], long: dict[str, Callable[[], object]], rounds: int
 ) -> dict[str, float]:
-    """Seconds of CPU time of one call; the short ones are called `CALLS` times in a row."""
+    """Return the CPU time of one call [s]; each in `short` is called `CALLS` times in a row."""
     torch.set_num_threads(1)
     work = {name: repeated(call) for name, call in short.items()} | long
     with torch.inference_mode():
@@ -133,12 +133,12 @@ def medians(
 
 
 def repeated(call: Callable[[], object]) -> Callable[[], object]:
-    """`CALLS` calls."""
+    """Return a function that makes `CALLS` calls."""
     return lambda: [call() for _ in range(CALLS)]
 
 
 def plain_torch(features: int) -> nn.Module:
-    """The context network as published, without time: three convolutions of one event."""
+    """Return the context network as published, without time: three convolutions over single events."""
     sizes = [3, 64, 128, features]
     layers = [
         nn.Sequential(nn.Conv1d(fan_in, fan_out, 1), nn.BatchNorm1d(fan_out), nn.ReLU())
@@ -148,7 +148,7 @@ def plain_torch(features: int) -> nn.Module:
 
 
 def copy_rows(target: np.ndarray, parts: list[np.ndarray]) -> None:
-    """Copy each part over the last."""
+    """Copy each part over the previous one."""
     for part in parts:
         np.copyto(target, part)
 
@@ -165,7 +165,7 @@ def read_rows(features: np.ndarray, embedding: np.ndarray, code: np.ndarray, bin
 
 
 def uniform_window(count: int) -> Window:
-    """A window of 64 x 64 pixels with `count` events anywhere."""
+    """Return a window of `count` uniform events on 64 x 64 pixels."""
     rng = np.random.default_rng(count)
     events = np.zeros(count, EVENT)
     events["t"] = np.sort(rng.integers(1, WINDOW_US + 1, count))
@@ -175,7 +175,7 @@ def uniform_window(count: int) -> Window:
 
 
 def main(rounds: int) -> None:
-    """Print all figures."""
+    """Measure and print all numbers."""
     rows = [(features, precision) for features in (256, 1024) for precision in PRECISIONS]
     figures = {
         "codings": {coding: compare(coding, rounds) for coding in CODINGS},

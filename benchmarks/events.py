@@ -1,22 +1,22 @@
-"""The event camera's time per frame, compared with plain copying and with the paper's published design.
+"""Compare the event camera's time per frame with plain copying and with the paper's published design.
 
 Run: OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 python -m benchmarks.events
-Expect: a table in about two minutes. All on one thread, medians of frames that take turns in
-one run. The scene is 24 gratings and three bars that move 0.1 ("sparse") or 1 ("dense")
-pixels per frame of 5 ms; threshold 0.2.
+Expect: two tables in about two minutes, on one thread; medians of interleaved frames in one run.
+The scene is 24 gratings and three bars that move 0.1 ("sparse") or 1 ("dense") pixels per frame
+of 5 ms; threshold 0.2.
 
-Columns. "together": time per frame if all frames are given in one call (`EventCamera.steps`),
-as a control step of the simulator gives its renders. "of copying": time as a multiple of
-`np.copyto` of the bytes that any design with this memory has to touch: per pixel the
-luminance (4) and the quiet band (8), per event what it changes and leaves (37: the event 13,
-the pixel's level 16 and band 8). "published": how many times longer the paper's design takes
-than one call per frame, and than all in one; typed anew: a loop over all pixels with two
-logarithms each, and a structured sort by field name. It makes fewer events, see memory
-"legacy" in `envs.events.camera`.
+Columns. "together": time per frame if all frames are passed in one call (`EventCamera.steps`),
+like the renders of a control step in the simulator. "of copying": time relative to `np.copyto`
+of the bytes that any design with this memory has to touch: 12 per pixel (luminance 4, quiet
+band 8) and 37 per event (the event 13, the pixel's level 16 and band 8). The last "published"
+and "together": how many times longer the paper's design takes than one call per frame, and than
+one call for all. The design is rewritten here: a loop over all pixels with two logarithms each,
+and a structured sort by field name. It produces fewer events, see memory "legacy" in
+`envs.events.camera`.
 
 A second table has the cost of each effect of a real sensor, and of the lights of conf/light: process time of
-an environment step at 64x64 and 200 Hz in the same corridors, one effect after the other in each step, and
-the median of the ratios to a step without any.
+an environment step at 64x64 and 200 Hz in the same corridors, with the effects interleaved in each step, and
+the median of the ratios to a step without effects.
 """
 
 import time
@@ -38,9 +38,9 @@ SPEEDS = (("sparse", 0.1), ("dense", 1.0))  # pixels per frame
 FRAMES = 12
 INTERVAL_US = 5000
 THRESHOLD = 0.2
-SECONDS = 2.5  # of measuring, per row
+SECONDS = 2.5  # time of measuring, per row
 PIXEL_BYTES, EVENT_BYTES = 12, 37
-EPISODES, STEPS = 4, 150  # of which effects are timed
+EPISODES, STEPS = 4, 150  # for the times of effects
 EFFECTS: dict[str, dict[str, object]] = {
     "none": {},
     "whole images": {"camera.refractory_us": 1},
@@ -56,7 +56,7 @@ PUBLISHED_EVENT = np.dtype([("timestamp", "f8"), ("x", "u2"), ("y", "u2"), ("pol
 
 
 def main() -> None:
-    """Measure and print the table."""
+    """Measure and print both tables."""
     head = ["pixels", "scene", "us/frame", "together", "events/pixel", "ns/pixel", "of copying"]
     rows = []
     for width, height in SIZES:
@@ -85,7 +85,7 @@ def show_effects() -> None:
         for env in envs.values():
             env.reset(seed=episode)
         for step, action in enumerate(np.random.default_rng(episode).integers(0, 3, STEPS).tolist()):
-            over, first = False, step % len(names)  # none is always the first, which finds the caches cold
+            over, first = False, step % len(names)  # take turns as the first, with cold caches
             for name in names[first:] + names[:first]:
                 env = envs[name]
                 start = time.process_time()
@@ -103,13 +103,13 @@ def show_effects() -> None:
 
 
 def light_settings(name: str) -> dict[str, object]:
-    """The settings of a light of conf/, by their keys."""
+    """Return the settings of a light in conf/light, by their keys."""
     groups = yaml.safe_load((REPOSITORY / "conf" / "light" / f"{name}.yaml").read_text())
     return {f"{group}.{key}": value for group, values in groups.items() for key, value in values.items()}
 
 
 def moving_gratings(width: int, height: int, speed: float) -> list[np.ndarray]:
-    """Luminance of 24 random gratings of 1 to 12 cycles per width, behind three dark bars."""
+    """Return frames of 24 random gratings of 1 to 12 cycles per width, behind three dark bars."""
     rng = np.random.default_rng(0)
     y, x = np.mgrid[:height, :width].astype(np.float32)
     wave = 2 * np.pi * rng.uniform(1, 12, 24) / width
@@ -128,7 +128,7 @@ def moving_gratings(width: int, height: int, speed: float) -> list[np.ndarray]:
 
 
 def design_times(frames: list[np.ndarray]) -> tuple[float, dict[str, float]]:
-    """Events per frame of the camera, and median seconds per frame of each of the designs."""
+    """Return the camera's events per frame, and the median seconds per frame of each design."""
     height, width = frames[0].shape
     camera, published = EventCamera(width, height, contrast_threshold=THRESHOLD), Published(width, height)
     times, stack = [k * INTERVAL_US for k in range(1, FRAMES)], np.stack(frames[1:])
@@ -165,7 +165,7 @@ class Published:
     """The design of the paper's published simulator, with the clock in microseconds."""
 
     def __init__(self, width: int, height: int) -> None:
-        """Make a camera for frames of (height, width)."""
+        """Create a camera for frames of (height, width)."""
         self._width = width
         self._last = np.zeros(width * height, np.float32)
         self._t_us = 0.0
@@ -176,7 +176,7 @@ class Published:
         self._last, self._t_us = luminance.ravel() + np.float32(0.001), 0.0
 
     def step(self, luminance: np.ndarray, t_us: int) -> np.ndarray:
-        """Events since the last frame, sorted by time alone."""
+        """Return the events since the last frame, sorted by time only."""
         current = luminance.ravel() + np.float32(0.001)
         output, image = np.zeros(10 * current.size, PUBLISHED_EVENT), np.zeros(current.size)
         interval = t_us - self._t_us
@@ -190,7 +190,7 @@ class Published:
 
 @numba.njit(cache=True, error_model="numpy")
 def published_events(current, last, frame, output, image):  # type: ignore[no-untyped-def]
-    """One less than the whole thresholds in the difference of two frames, at most 10; returns how many."""
+    """Write a pixel's whole thresholds less one as events, at most 10; return the number of events."""
     t0, interval, width = frame
     count = 0
     for i in range(current.size):

@@ -1,10 +1,10 @@
-"""How many renders and samples an event error takes: the measurements behind `envs.fidelity.plan_renders`.
+"""Measure the event error by number of renders and samples, on which `envs.fidelity.plan_renders` is based.
 
 Run: python -m benchmarks.fidelity [scene ...]
-Expect: about two minutes per scene on one core; poles and texture_change unless others are
-named. For each control rate and threshold: the event error at 1 to 16 renders per control
-step with converged anti-aliasing, then with converged renders at each anti-aliasing, and
-what the plan achieves at tolerance 0.05.
+Expect: about two minutes per scene on one core; by default poles and texture_change. For each
+control rate and threshold: the event error at 1 to 16 renders per control step with converged
+anti-aliasing, then at 1 to 4 samples with converged renders, then with the plan for tolerance
+0.05.
 """
 
 import dataclasses
@@ -39,7 +39,7 @@ def main() -> None:
 
 
 def errors(scene: str, hz: float, threshold: float) -> list[str]:
-    """The cells of one row."""
+    """Return the cells of one row."""
     config = EnvConfig(scene=scene, control_hz=hz, camera=CameraConfig(contrast_threshold=threshold))
     step_m = config.speed_mps / hz
     exact = REFERENCE_SAMPLES["raycast"]

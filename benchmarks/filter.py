@@ -1,8 +1,8 @@
-"""What the neighbour filter removes of true and of false events, by condition.
+"""Measure the shares of true and false events that pass the neighbour filter, by condition.
 
 Run: python -m benchmarks.filter
-Expect: a table in about a minute on one core: of 8 corridors the share of the events that the scene made,
-and of those that the sensor invented, which pass with k = 1, 2 and 3 of 8 neighbours within 5 ms.
+Expect: a table in about a minute on one core: in 8 corridors, the shares of true and of false events that
+pass the filter with k = 1, 2 and 3 of 8 neighbours within 5 ms.
 """
 
 import numpy as np
@@ -52,7 +52,7 @@ def main() -> None:
 
 
 def measure(changes: dict[str, object]) -> np.ndarray:
-    """Steps; true and false events; of both those that pass, for each of `SUPPORTS`; float64."""
+    """Return counts, float64: steps, true and false events, and both that pass with each of `SUPPORTS`."""
     env = CorridorVectorEnv(CORRIDORS, env_with(EnvConfig(window_capacity=None, split="validation"), changes))
     env.reset(seed=0)
     rng, counts = np.random.default_rng(0), np.zeros(3 + 2 * len(SUPPORTS))
@@ -72,13 +72,13 @@ def measure(changes: dict[str, object]) -> np.ndarray:
 
 
 def split(events: np.ndarray, real: set[tuple[int, ...]]) -> tuple[int, int]:
-    """How many of the events the scene made, and how many are false."""
+    """Return the numbers of true and of false events."""
     true = sum(event in real for event in events.tolist())
     return true, events.size - true
 
 
 def line(counts: np.ndarray) -> list[str]:
-    """The cells of a row."""
+    """Return the cells of a row."""
     steps, true, false = counts[:3]
     passed = counts[3:].reshape(-1, 2) / np.maximum([true, false], 1)
     cells = [f"{100 * share:.1f}" for pair in passed for share in pair]

@@ -1,10 +1,10 @@
-"""What frames at a low rate lose of a scene's events, what is said of it, and what optical flow brings back.
+"""Measure how many events a low frame rate misses, the estimate of that loss, and the gain by optical flow.
 
 Run: OMP_NUM_THREADS=1 python -m benchmarks.frame_rate
-Expect: a table in about half a minute. Corridors of poles, straight through at 20 m/s, 96x72 pixels; frames
-at 1,000 Hz are the truth, of which others see every 16th, 32nd and 64th. "Missed": share of the true events,
-and what `FrameLoss` estimates from the frames alone. "r": correlation of net events of each pixel and 5 ms,
-blurred by a pixel. "flow" needs OpenCV (the extra `flow`), and is left out without it.
+Expect: a table in about half a minute. Corridors of poles, straight through at 20 m/s, 96x72 pixels. Frames
+at 1,000 Hz are the truth; the rows use every 16th, 32nd and 64th of them. "Missed": missing share of the true
+events, and its estimate by `FrameLoss` from the frames alone. "r": correlation of net events per pixel and
+5 ms, blurred by a pixel. "flow" needs OpenCV (the extra `flow`), and is left out without it.
 """
 
 import importlib.util
@@ -51,7 +51,7 @@ def main() -> None:
 
 
 def film(seed: int) -> np.ndarray:
-    """Frames of a corridor at `TRUE_HZ`, float32 (K, H, W); K - 1 is a multiple of every one of `EVERY`."""
+    """Return frames of a corridor at `TRUE_HZ`, float32 (K, H, W); each of `EVERY` divides K - 1."""
     renderer = RaycastRenderer(
         make_scene("poles", np.random.default_rng(seed)),
         CAMERA.width,
@@ -64,7 +64,7 @@ def film(seed: int) -> np.ndarray:
 
 
 def seen(frames: np.ndarray, every: int, by_flow: bool) -> tuple[np.ndarray, float]:
-    """Events of every so many frames, and which share of a scene's events they are estimated to miss."""
+    """Return the events of each `every`-th frame, and the estimated share of missed events."""
     eye = Eye(CAMERA, FaultsConfig(), np.random.default_rng(0), by_flow)
     eye.reset(frames[0], 0)
     steps = [
@@ -74,7 +74,7 @@ def seen(frames: np.ndarray, every: int, by_flow: bool) -> tuple[np.ndarray, flo
 
 
 def likeness(truths: list[np.ndarray], others: list[np.ndarray]) -> float:
-    """Correlation of net events of each pixel and window, blurred by a pixel, over all corridors."""
+    """Return the correlation of net events per pixel and window, blurred by a pixel, over all corridors."""
     pairs = zip(truths, others, strict=True)
     images = [(net_images(truth), net_images(other)) for truth, other in pairs]
     first, second = (np.concatenate(side).ravel() for side in zip(*images, strict=True))
@@ -82,7 +82,7 @@ def likeness(truths: list[np.ndarray], others: list[np.ndarray]) -> float:
 
 
 def net_images(events: np.ndarray) -> np.ndarray:
-    """ON less OFF events of each window of 5 ms, blurred by a pixel, float64 (windows, H, W)."""
+    """Return ON minus OFF events of each window of 5 ms, blurred by a pixel, float64 (windows, H, W)."""
     windows = int(SECONDS * 1_000_000) // WINDOW_US + 1
     net = np.zeros((windows, CAMERA.height, CAMERA.width))
     np.add.at(net, (events["t"] // WINDOW_US, events["y"], events["x"]), events["p"])

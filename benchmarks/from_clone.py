@@ -1,10 +1,10 @@
-"""Time from an empty clone to each first result, as a new user has it.
+"""Measure the time from an empty clone to each first result of a new user.
 
-Run: python -m benchmarks.from_clone [COMMIT], HEAD unless another is named
-Expect: a table in 10 to 45 minutes, on a machine that does nothing else: seconds of `make setup`,
-`make demo` and `make bytestream` in a clone made for it, of each stage of the last, and of `make demo`
-again. Nothing is taken from caches of this machine: its packages and compiled kernels are left
-alone. The clone is removed.
+Run: python -m benchmarks.from_clone [COMMIT]; COMMIT is HEAD by default
+Expect: a table in 10 to 45 minutes, on an otherwise idle machine: seconds of `make setup`,
+`make demo` and `make bytestream` in a new clone, of each stage of the last, and of a second `make demo`.
+Caches of this machine are not used: neither its packages nor its compiled kernels. The clone is
+removed afterwards.
 """
 
 import os
@@ -34,7 +34,7 @@ def main() -> None:
 
 
 def first_results(clone: Path) -> Iterator[tuple[str, float]]:
-    """What a new user waits for, and how long [s]."""
+    """Yield what a new user waits for, and how long [s]."""
     setup, first, again = (make(clone, target) for target in ("setup", "demo", "demo"))
     yield "make setup", setup
     yield "make setup and make demo", setup + first
@@ -49,7 +49,7 @@ def first_results(clone: Path) -> Iterator[tuple[str, float]]:
 
 
 def make(clone: Path, target: str) -> float:
-    """Seconds of a target of the Makefile."""
+    """Run a target of the Makefile; return its wall time [s]."""
     began = time.perf_counter()
     run("make", "-C", str(clone), target, f"VENV={clone / '.venv'}")
     return time.perf_counter() - began
@@ -61,7 +61,7 @@ def run(*words: str) -> None:
 
 
 def without_this_environment() -> dict[str, str]:
-    """The variables of a shell in which no virtual environment is active."""
+    """Return the variables of a shell in which no virtual environment is active."""
     kept = os.environ.keys() - {"VIRTUAL_ENV", "PYTHONPATH", "MAKEFLAGS", "MAKELEVEL"}
     return {name: os.environ[name] for name in kept}
 

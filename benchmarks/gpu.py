@@ -1,9 +1,9 @@
-"""PPO on pictures with its gradients on the processor and on a GPU, in turns.
+"""Compare PPO on event images with its gradients on the CPU and on a GPU, in interleaved rounds.
 
 Run: OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 python -m benchmarks.gpu
-Expect: a table in one to two minutes, and without a GPU a line that says so. An iteration samples 2,048
-steps and learns 10 epochs: `ppo` in one process with minibatches of 32, `ppo_fast` with two processes that
-sample, as many threads of the learner, and minibatches of 256. Wall time, medians over the rounds.
+Expect: a table in one to two minutes; without a GPU, a line that says so. An iteration samples 2,048
+steps and learns 10 epochs: `ppo` in one process with minibatches of 32, `ppo_fast` with two sampling
+processes, two threads of the learner, and minibatches of 256. Wall time, medians over the rounds.
 """
 
 import os
@@ -46,12 +46,12 @@ def main() -> None:
 
 
 def trainings(folder: Path) -> dict[tuple[str, str], Callable[[], object]]:
-    """One iteration of each algorithm on each device."""
+    """Return a function for one iteration of each algorithm on each device."""
     work: dict[tuple[str, str], Callable[[], object]] = {}
     for algorithm in ALGORITHMS:
         for device in DEVICES:
             config = composed(f"algo={algorithm}", "model=event_image", "algo.lr_schedule=constant")
-            # All four are there at once: on a machine of two cores Ray would let one wait forever.
+            # All four exist at once: with only two cores, Ray would let one of them wait forever.
             start_ray(replace(config.cluster, num_cpus=4), folder)
             os.environ.update(device_variables(device))  # read when the learner is built, in this process
             work[algorithm, device] = build_algorithm(config).build_algo().train

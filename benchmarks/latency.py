@@ -1,9 +1,9 @@
-"""How long a robot waits from the events of a control step to an action, by policy and window size.
+"""Measure the time from the events of a control step to an action, by policy and window size.
 
 Run: OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 python -m benchmarks.latency
 Expect: a table in about a minute, one thread, wall time: the median and the 99th percentile of
 `models.policy.Policy.act`, without Ray, and the median of the same policy as an ONNX file in
-onnxruntime. Weights are random, which changes no time. At 200 Hz a control step is 5,000 us.
+onnxruntime. Weights are random, which does not affect the time. At 200 Hz a control step is 5,000 us.
 """
 
 import tempfile
@@ -50,7 +50,7 @@ def main() -> None:
 
 
 def random_policy(name: str) -> Policy:
-    """A policy of the kind with its default sizes and random weights."""
+    """Return a policy of a kind with default sizes and random weights."""
     config = composed(f"model={name}")
     spec = policy_spec(config)
     encoder = encoder_of(EventVAE.of(spec.evae).freeze()) if spec.frozen else None
@@ -58,14 +58,14 @@ def random_policy(name: str) -> Policy:
 
 
 def load(file: Path) -> Any:
-    """An onnxruntime session of one thread."""
+    """Return an onnxruntime session with one thread."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     return onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
 
 
 def latency_text(policy: Policy, session: Any, size: int) -> str:
-    """Both latencies for windows of `size` events, as text."""
+    """Return both latencies for windows of `size` events, as text."""
     events = random_events(size)
     rows = np.stack([events[field].astype(np.int64) for field in "txyp"], axis=1)
     inputs = {"events": rows, "window_us": np.array(WINDOW_US), "first": np.array(False)}
@@ -78,7 +78,7 @@ def latency_text(policy: Policy, session: Any, size: int) -> str:
 
 
 def micros(call: Callable[[], object]) -> np.ndarray:
-    """Wall time of each call [us]."""
+    """Return the wall time of each call [us]."""
     taken = np.empty(CALLS + WARM)
     for k in range(len(taken)):
         start = time.perf_counter()
@@ -88,7 +88,7 @@ def micros(call: Callable[[], object]) -> np.ndarray:
 
 
 def random_events(size: int) -> np.ndarray:
-    """Events anywhere on the default sensor, in time order."""
+    """Return uniform events on the default sensor, sorted by time."""
     rng, camera = np.random.default_rng(0), EnvConfig().camera
     events = np.zeros(size, EVENT)
     events["t"] = np.sort(rng.integers(1, WINDOW_US + 1, size))

@@ -1,12 +1,12 @@
-"""Environment steps per second of whole PPO training, compared with stable-baselines3 in the same corridors.
+"""Compare environment steps per second of whole PPO training with stable-baselines3 in the same corridors.
 
 Run: OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 python -m benchmarks.ppo
-Expect: two tables in about eight minutes. "Ours" is the loop that a job runs with
-`jobs.training.ppo.learner`, "tensor by tensor" the same without `models.policy.dense_update`, "RLlib's
-learner" RLlib's loop as it comes with our env runner, "stable-baselines3" its PPO with the same networks,
-encoder, corridors and settings. All take turns in one process; an iteration samples 2,048 steps in 16
-corridors and learns 10 epochs. Seconds are wall time, medians over the rounds: `ppo_fast` samples in
-processes of its own, so the machine should be quiet. The second table is ours for every kind of policy.
+Expect: two tables in about eight minutes. "Ours" is a job's loop with `jobs.training.ppo.learner`; "tensor by
+tensor" is the same without `models.policy.dense_update`; "RLlib's learner" is RLlib's unchanged loop with our
+env runner; "stable-baselines3" is its PPO with the same networks, encoder, corridors and settings. All take
+turns in one process; an iteration samples 2,048 steps in 16 corridors and learns 10 epochs. Seconds are wall
+time, medians over the rounds. The machine should be idle, because `ppo_fast` samples in separate processes.
+The second table has our loop for every kind of policy.
 """
 
 import dataclasses
@@ -44,22 +44,22 @@ from models.policy.features import push_features
 
 ROUNDS, FEW_ROUNDS = 5, 2
 MINIBATCHES = (32, 256)
-STEPS = 2048  # of an iteration (appendix D.1.2)
+STEPS = 2048  # steps of an iteration (appendix D.1.2)
 CONSTANT = "algo.lr_schedule=constant"
 RIVALS = tuple(f"stable-baselines3, {size}" for size in MINIBATCHES)
 
 
 class TensorByTensor(PlainPPOLearner):
-    """Updates dense networks as all others."""
+    """A learner that updates dense networks like all others, without compiled updates."""
 
     _compiled = False
 
 
 class EncodedCorridors(VecEnv):
-    """Corridors for stable-baselines3: stacks of latents, each episode followed by the next."""
+    """Corridors for stable-baselines3: they return stacks of latents and restart after each episode."""
 
     def __init__(self, num_envs: int, config: EnvConfig, table: EncoderTable, stack: int) -> None:
-        """Make `num_envs` corridors that `table` encodes."""
+        """Create `num_envs` corridors, whose windows `table` encodes."""
         self.corridors = [CorridorEnv(config) for _ in range(num_envs)]
         self.table, self.shape = table, (num_envs, stack, len(table.head[1]))
         space = gymnasium.spaces.Box(-np.inf, np.inf, self.shape[1:], np.float32)
@@ -73,7 +73,7 @@ class EncodedCorridors(VecEnv):
         return self.stacks
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Keep the actions."""
+        """Store the actions."""
         self._actions = actions
 
     def step_wait(self) -> Any:
@@ -95,10 +95,10 @@ class EncodedCorridors(VecEnv):
         return push_features(self.stacks, self.table.encode_windows(windows), first)
 
     def close(self) -> None:
-        """Nothing to close."""
+        """Do nothing."""
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """No corridor is wrapped."""
+        """Return False for every corridor: none is wrapped."""
         return [False] * self.num_envs
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
@@ -106,7 +106,7 @@ class EncodedCorridors(VecEnv):
         return [getattr(env, method_name)(*args, **kwargs) for env in self.corridors]
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """An attribute of every corridor."""
+        """Return an attribute of every corridor."""
         return [getattr(env, attr_name) for env in self.corridors]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
@@ -135,7 +135,7 @@ def show(title: str, seconds: dict[str, float], units: tuple[str, ...]) -> None:
 
 
 def against_others(folder: Path) -> dict[str, Callable[[], object]]:
-    """One iteration on bytestream of our learner, with and without compiled steps, and of the others."""
+    """Return a function for one iteration on bytestream of each learner, ours also without compiled steps."""
     evae = EventVAE.of(evae_settings(composed())).freeze()
     path, table = encoder_file(evae, folder), EncoderTable.from_evae(evae)
     work: dict[str, Callable[[], object]] = {}
@@ -162,7 +162,7 @@ def built(config: Config, algorithm: AlgorithmConfig) -> Any:
 
 
 def every_kind(folder: Path) -> dict[str, Callable[[], object]]:
-    """One iteration of our learner for each kind of policy."""
+    """Return a function for one iteration of our learner, for each kind of policy."""
     work: dict[str, Callable[[], object]] = {}
     rows = {name: [f"model={name}"] for name in KINDS}
     rows["bytestream, fine-tuned"] = ["model=bytestream", "model.encoder=finetuned"]
@@ -176,7 +176,7 @@ def every_kind(folder: Path) -> dict[str, Callable[[], object]]:
 
 
 def encoder_file(evae: EventVAE, folder: Path) -> Path:
-    """The file of an encoder for the default sensor."""
+    """Write an encoder for the default sensor; return its file."""
     sensor = sensor_settings(EnvConfig())
     path = folder / f"{evae.settings.variant}.safetensors"
     save_encoder(path, evae, {"sensor": sensor, "sensor_hash": settings_hash(sensor)})
@@ -184,7 +184,7 @@ def encoder_file(evae: EventVAE, folder: Path) -> Path:
 
 
 def stable_baselines(config: Config, table: EncoderTable) -> PPO:
-    """PPO of stable-baselines3 with an experiment's settings."""
+    """Return PPO of stable-baselines3 with an experiment's settings."""
     algo, env = (
         cast(AlgoConfig, config.algo),
         dataclasses.replace(config.env, split="train", observation="window"),

@@ -1,8 +1,9 @@
-"""Peak memory and processor time of writing and reading every event file format at 1280x720, a process each.
+"""Measure peak memory and CPU time of writing and reading every event file format at 1280x720.
 
 Run: python -m benchmarks.recording_memory
-Expect: one table in a minute or two. Memory is what a task adds to a process that has its libraries and, if
-it writes, its events; "in parts" hands over and takes `PART` events at a time. The last rows are a video.
+Expect: one table in a minute or two. Each task runs in its own process. Memory is what the task adds
+to the libraries and, for writing, to the events; "in parts" means `PART` events at a time. The last rows
+are a video.
 """
 
 import resource
@@ -42,7 +43,7 @@ def main() -> None:
 def measured(task: str, folder: str, format: str) -> tuple[str, str]:
     """Return processor time [s] and peak memory beyond the libraries [MiB] of a task, in a new process."""
     words = [sys.executable, "-W", "ignore", "-m", __spec__.name, task, folder, format]
-    for _ in range(1 + (task in ("write", "video to events"))):  # the first of a format may compile
+    for _ in range(1 + (task in ("write", "video to events"))):  # the first run of a format may compile
         child = subprocess.run(  # noqa: S603  this module
             words, capture_output=True, text=True, check=False
         )
@@ -72,7 +73,7 @@ def video(folder: Path) -> None:
 
 
 def do(task: str, folder: Path, format: str) -> Callable[[], object]:
-    """Return a task, with what it needs imported and made."""
+    """Return a task as a function, after its imports and the creation of its events."""
     from envs import recordings
     from envs.recordings.video import video_steps
 
@@ -103,7 +104,7 @@ def do(task: str, folder: Path, format: str) -> Callable[[], object]:
 
 
 def child(task: str, folder: str, format: str) -> None:
-    """Do one task and print its processor time and how far the process's memory rose."""
+    """Do one task; print its processor time [s] and the increase of the process's peak memory [MiB]."""
     work = do(task, Path(folder), format)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     begun = time.process_time()

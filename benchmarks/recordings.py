@@ -1,10 +1,10 @@
-"""Speed and size of every event file format, against numpy's own npz and against a copy, in one run.
+"""Measure speed and size of every event file format, relative to numpy's npz and to a copy in memory.
 
 Run: python -m benchmarks.recordings
-Expect: one table in about twenty seconds. "time / np.load" compares with `np.load` of a
-compressed npz file of the same events, its four arrays read and nothing checked; "time / copy"
-with the limit of any reader, a copy of the same events in memory. The events are those of a real
-recording where there is one (the folder EVADE_DATA, else ../shared/data), else a simulated flight's.
+Expect: one table in about twenty seconds. "time / np.load" is relative to `np.load` of the four
+arrays of a compressed npz file of the same events, without checks; "time / copy" is relative to
+the limit of any reader, a copy of the same events in memory. The events are from a real recording if
+there is one (folder EVADE_DATA, by default ../shared/data), otherwise from a simulated flight.
 """
 
 import os
@@ -61,7 +61,7 @@ def main() -> None:
 
 
 def recording() -> tuple[np.ndarray, int, int, str]:
-    """Events to write and read, width and height of their sensor, and where they come from."""
+    """Return events to write and read, width and height of their sensor, and their source."""
     if SAMPLE.is_file():
         file = read_events(SAMPLE)
         return file.events, file.width or 0, file.height or 0, f"a street ({SAMPLE.name})"

@@ -1,11 +1,11 @@
-"""Milliseconds per frame of the ray caster by scene, size and texture, beside pyrender; and its error.
+"""Measure the ray caster's time per frame by scene, size and texture, compared with pyrender, and its error.
 
 Run: python -m benchmarks.render
 Expect: two tables in about two minutes on one core. Times are CPU time of the thread
-(`time.thread_time`), which other processes disturb less than the clock, along a flight
+(`time.thread_time`), which other processes disturb less than wall time, along a flight
 from y = 0 to 90 m at 2 m height; medians of interleaved rounds. The error is the difference
-from the mean of 32 x 32 point samples per pixel, which at an upright edge is itself off by
-up to 1 / 64 of a pixel.
+from the mean of 32 x 32 point samples per pixel. That mean is itself wrong by up to 1 / 64 of
+a pixel at a vertical edge.
 """
 
 import contextlib
@@ -51,7 +51,7 @@ def main() -> None:
 
 
 def cases() -> dict[str, Scene]:
-    """Scenes by name: numbers of poles, each kind, and textures on 40 poles."""
+    """Return name -> scene: several numbers of poles, each kind of obstacle, and textures on 40 poles."""
     scenes = {f"{count} poles": crowd(POLE, count) for count in (0, 40, 400)}
     scenes |= {f"40 {KINDS[kind]}s": crowd(kind, 40) for kind in (CONE, ELLIPSOID)}
     scenes["12 gates"] = gates(12)
@@ -61,7 +61,7 @@ def cases() -> dict[str, Scene]:
 
 
 def crowd(kind: int, count: int) -> Scene:
-    """`count` bodies of a kind on a jittered grid of a lane 30 m wide and 90 m long."""
+    """Return a scene of `count` obstacles of a kind on a jittered grid, 30 m wide and 90 m long."""
     rng = np.random.default_rng(0)
     made = np.zeros(count, OBSTACLE)
     columns = max(1, round(math.sqrt(count * 28.0 / 90.0)))
@@ -78,7 +78,7 @@ def crowd(kind: int, count: int) -> Scene:
 
 
 def gates(count: int) -> Scene:
-    """`count` gates of four boxes each, one behind the other."""
+    """Return a scene of `count` gates, one behind the other, each of four boxes."""
     made = np.zeros((count, 4), OBSTACLE)
     x = np.random.default_rng(0).uniform(-11.0, 11.0, count)
     made["kind"], made["albedo"], made["ry"] = BOX, 0.25, 0.25
@@ -89,7 +89,7 @@ def gates(count: int) -> Scene:
 
 
 def textured(scene: Scene, pattern: str) -> Scene:
-    """The scene with a pattern on all its surfaces."""
+    """Return the scene with a pattern on all its surfaces."""
     return replace(
         scene,
         ground_texture=Texture(pattern, 2.0, 0.3),
@@ -99,7 +99,7 @@ def textured(scene: Scene, pattern: str) -> Scene:
 
 
 def frame_times(scenes: Mapping[str, Scene]) -> dict[tuple[str, str], float]:
-    """Milliseconds per frame by scene and column of the table; without pyrender where EGL does not work."""
+    """Return the time per frame [ms] by scene and column of the table; without pyrender if EGL fails."""
     work: dict[tuple[str, str], Callable[[], object]] = {}
     for name, scene in scenes.items():
         for size in SIZES:
@@ -119,7 +119,7 @@ def follow_path(render: Callable[..., object]) -> None:
 
 
 def errors(scene: Scene) -> dict[int, np.ndarray]:
-    """Absolute differences from point samples, by the number of samples."""
+    """Return absolute differences from point samples, by number of samples."""
     found: dict[int, list[np.ndarray]] = {1: [], 2: [], 4: []}
     for pose in POSES:
         points = sample_luminance(scene, pose, 64, 64, samples=32)

@@ -1,11 +1,11 @@
-"""How training and sweeps grow with cores: measured on simulated nodes of this machine, then a model.
+"""Measure how training and sweeps scale with cores, on simulated nodes of this machine, and model it.
 
 Run: OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 python -m benchmarks.scaling [docs/data/scaling.json]
 Expect: five tables in about five minutes, and their numbers in a file if one is named, from which
-`python -m docs.from_data` draws the plot; the machine should be quiet. Nodes beyond this machine's cores
-share them, so that measured rates stop growing there; the model predicts them for nodes of their own. Its
-inputs are measured: seconds of a core for a step simulated, seconds of the learner and bytes through the
-object store for a step learnt, seconds of a core for a condition, seconds of the driver for a trial.
+`python -m docs.from_data` draws the plot; the machine should be idle. Nodes beyond this machine's cores
+share them, so measured rates stop growing; the model predicts the rates of separate machines. Its inputs are
+measured: seconds of a core per simulated step, seconds of the learner and bytes through the object store per
+learned step, seconds of a core per condition, seconds of the driver per trial.
 """
 
 import contextlib
@@ -42,13 +42,13 @@ from jobs.training.sampling.env_runner import PlainEnvRunner
 
 ROUNDS = 3
 TRIALS = 1000
-CONDITIONS, EPISODES = 12, 7  # evaluated to measure their rate; of one condition in the default sweep
+CONDITIONS, EPISODES = 12, 7  # conditions to evaluate; episodes of a condition, as in the default sweep
 POLICY = "event_columns-s0"
 OBJECT_STORE = 150 * 2**20
 
 
 def main() -> None:
-    """Measure, print the tables, and write what was measured into the file that is named, if one is."""
+    """Measure, print the tables, and write the measurements to a file if one is named."""
     settings = ["model=event_columns", "algo=ppo_fast", "algo.lr_schedule=constant"]
     step_bytes, weight_bytes = bytes_sent(*settings)
     rates: dict[tuple[int, int], float] = {}
@@ -79,7 +79,7 @@ def main() -> None:
 
 
 def show_measured(rates: Mapping[tuple[int, int], float], sweeps: Mapping[int, float]) -> None:
-    """Print what was measured on this machine."""
+    """Print the measurements on this machine."""
     show("Training, measured", ("nodes", "env runners", "env steps/s"),
          [(n, r, f"{rate:,.0f}") for (n, r), rate in rates.items()])  # fmt: skip
     show("A sweep, measured", ("cores by Ray's account", "conditions/h"),
@@ -87,7 +87,7 @@ def show_measured(rates: Mapping[tuple[int, int], float], sweeps: Mapping[int, f
 
 
 def show_model(costs: Costs) -> None:
-    """Print the costs, and what they come to on more cores."""
+    """Print the costs, and the rates that the model predicts for more cores."""
     show("Costs", ("of", "is"), [(name, f"{value:.3g}") for name, value in costs._asdict().items()])
     show(
         "Training, the model",
@@ -104,7 +104,7 @@ def show_model(costs: Costs) -> None:
 
 
 def bytes_sent(*words: str) -> tuple[float, float]:
-    """Bytes of a step's sample and of the weights, as they travel between processes."""
+    """Return the bytes of a step's sample and of the weights, as sent between processes."""
     here = build_algorithm(composed(*words, "algo.num_env_runners=0"))
     runner = PlainEnvRunner(config=here, worker_index=0)
     episodes = runner.sample(num_timesteps=STEPS)
@@ -115,7 +115,7 @@ def bytes_sent(*words: str) -> tuple[float, float]:
 
 
 def training_rate(*words: str) -> tuple[float, float, float]:
-    """Environment steps per second of an iteration, and its seconds sampling and learning per step."""
+    """Return an iteration's environment steps per second, and seconds of sampling and learning per step."""
     algorithm = build_algorithm(composed(*words)).build_algo()
     algorithm.train()  # compiles
     rates, shares = [], []
@@ -131,7 +131,7 @@ def training_rate(*words: str) -> tuple[float, float, float]:
 
 
 def seconds_of(trial: Callable[[dict[str, int]], None], count: int, folder: Path) -> float:
-    """Wall time of so many trials, scheduled as a sweep's are, once a worker per core is there [s]."""
+    """Return the wall time [s] of `count` trials, scheduled as in a sweep, with a worker per core ready."""
     os.environ["TUNE_GLOBAL_CHECKPOINT_S"] = "3600"
     logging.getLogger("ray.tune").setLevel(
         logging.ERROR
@@ -154,12 +154,12 @@ def seconds_of(trial: Callable[[dict[str, int]], None], count: int, folder: Path
 
 
 def do_nothing(params: dict[str, int]) -> None:
-    """A trial that costs its scheduling alone."""
+    """Run a trial that costs only its scheduling."""
     tune.report({"key": params["trial"]})
 
 
 def evaluate_condition(params: dict[str, int]) -> None:
-    """A trial that evaluates a policy under the default condition."""
+    """Run a trial that evaluates a policy under the default condition."""
     first = params["trial"] * EPISODES
     agent = cached_agent(str(PRETRAINED / POLICY), "stochastic")
     env = EnvConfig(scene=HELD_OUT_SCENE, split="eval")
@@ -168,7 +168,7 @@ def evaluate_condition(params: dict[str, int]) -> None:
 
 
 def ask_for_token(folder: Path) -> None:
-    """Let the clusters of this process ask everyone for a token, which is made in a folder of its own."""
+    """Let the clusters of this process require a token, which is created in `folder`."""
     os.environ.update({**QUIET, "RAY_TMPDIR": str(ray_folder())})
     use_token(folder / "token")
     enable_token_auth_by_default()  # Ray, imported above, has read the environment already
@@ -176,7 +176,7 @@ def ask_for_token(folder: Path) -> None:
 
 @contextlib.contextmanager
 def simulated(nodes: int, cores: int) -> Iterator[None]:
-    """A Ray of so many nodes, all on this machine's loopback, each with so many cores by its own account."""
+    """Run a Ray of `nodes` nodes on this machine's loopback, each of which claims `cores` cores."""
     with on_loopback():
         cluster = Cluster(
             initialize_head=True,

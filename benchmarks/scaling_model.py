@@ -1,4 +1,4 @@
-"""How training and sweeps grow with cores: a model from what `benchmarks.scaling` measures, and its plot."""
+"""Model how training and sweeps scale with cores, from measurements of `benchmarks.scaling`, and plot it."""
 
 from collections.abc import Mapping
 from typing import NamedTuple, TypedDict
@@ -9,21 +9,21 @@ from matplotlib.ticker import LogLocator, NullFormatter
 
 from jobs.analysis.colours import AMBER, BLUE, GREEN, MUTED
 
-STEPS = 2048  # of an iteration (appendix D.1.2)
+STEPS = 2048  # steps of an iteration (appendix D.1.2)
 BANDWIDTH = 1e9  # of the network between nodes [bytes/s]: 10 Gbit/s
 CORES = (1, 2, 10, 100, 1000)
 
 
 class Costs(NamedTuple):
-    """What the model is made from.
+    """The costs from which the model is computed.
 
     Attributes:
-        step_s: Of a core, for a simulated step [s].
-        learn_s: Of the learner, for a step learnt; all runners wait [s].
-        step_bytes: Through the object store, for a step.
-        weight_bytes: To each runner, for an iteration.
-        cell_s: Of a core, for a condition of a sweep [s].
-        trial_s: Of the driver, for a trial of a sweep [s].
+        step_s: Time of a core per simulated step [s].
+        learn_s: Time of the learner per learned step, while all runners wait [s].
+        step_bytes: Bytes through the object store per step.
+        weight_bytes: Bytes sent to each runner per iteration.
+        cell_s: Time of a core per condition of a sweep [s].
+        trial_s: Time of the driver per trial of a sweep [s].
     """
 
     step_s: float
@@ -35,13 +35,13 @@ class Costs(NamedTuple):
 
 
 class Measured(NamedTuple):
-    """What was measured on one machine.
+    """Measurements on one machine.
 
     Attributes:
-        cores: Of the machine; simulated nodes share them.
-        costs: Of its parts.
+        cores: Cores of the machine; simulated nodes share them.
+        costs: Costs of the parts.
         rates: (Simulated nodes, env runners) -> environment steps per second of a training.
-        sweeps: Cores by Ray's account -> conditions per second of a sweep.
+        sweeps: Number of cores that Ray counts -> conditions per second of a sweep.
     """
 
     cores: int
@@ -66,7 +66,7 @@ class SweepRate(TypedDict):
 
 
 class PlainMeasured(TypedDict):
-    """`Measured` in plain containers, and where it is from."""
+    """`Measured` in plain containers, with its source."""
 
     source: str
     cores: int
@@ -76,7 +76,7 @@ class PlainMeasured(TypedDict):
 
 
 def as_plain(measured: Measured, source: str) -> PlainMeasured:
-    """Plain containers for a JSON file; `source` says where the numbers are from."""
+    """Return the measurements as plain containers for JSON; `source` says where the numbers come from."""
     return {
         "source": source,
         "cores": measured.cores,
@@ -92,7 +92,7 @@ def as_plain(measured: Measured, source: str) -> PlainMeasured:
 
 
 def from_plain(values: PlainMeasured) -> Measured:
-    """What `as_plain` was given."""
+    """Return the measurements from the result of `as_plain`."""
     return Measured(
         values["cores"],
         Costs(**values["costs"]),
@@ -102,24 +102,24 @@ def from_plain(values: PlainMeasured) -> Measured:
 
 
 def iteration_s(costs: Costs, cores: int) -> tuple[float, float, float]:
-    """Seconds of one PPO iteration that are spent sampling, learning, and sending samples and weights.
+    """Return the seconds of one PPO iteration spent sampling, learning, and sending samples and weights.
 
-    Each runner samples on a core; one process learns while they wait, and receives all samples.
+    Each runner samples on a core; one process receives all samples and learns while the runners wait.
     """
     sent = STEPS * costs.step_bytes + cores * costs.weight_bytes
     return STEPS * costs.step_s / cores, STEPS * costs.learn_s, sent / BANDWIDTH
 
 
 def conditions_per_s(costs: Costs, cores: int) -> float:
-    """Conditions of a sweep per second: cores share nothing, until the driver is busy all the time."""
+    """Return a sweep's conditions per second: proportional to the cores, until the driver is always busy."""
     return min(cores / costs.cell_s, 1 / costs.trial_s)
 
 
 def plot_scaling(measured: Measured) -> Figure:
-    """Draw rates over cores: the model as a line, what was measured on this machine as points.
+    """Draw rates over cores: the model as a line, the measurements on this machine as points.
 
-    Beyond the machine's cores nothing can be measured: the model's line is dashed there, on grey, and points
-    are hollow, because their processes share its cores.
+    Beyond the machine's cores the model is extrapolated: its line is dashed, on grey. Points there are
+    hollow, because their processes share the machine's cores.
     """
     figure = Figure(figsize=(9, 4.2), layout="constrained")
     left, right = figure.subplots(1, 2)
@@ -150,7 +150,7 @@ def plot_scaling(measured: Measured) -> Figure:
 
 
 def draw_model(axes: Axes, values: Mapping[int, float], cores: int) -> None:
-    """Draw the model over the number of cores: solid up to `cores`, beyond dashed and on grey."""
+    """Draw the model over the number of cores: solid up to `cores`, then dashed and on grey."""
     within = [count for count in values if count <= cores]
     beyond = [count for count in values if count >= cores]
     axes.axvspan(cores, 1.25 * max(values), color=MUTED, alpha=0.12, lw=0)
@@ -160,12 +160,12 @@ def draw_model(axes: Axes, values: Mapping[int, float], cores: int) -> None:
 
 
 def draw_points(axes: Axes, values: Mapping[int, float], cores: int, look: tuple[str, str, str]) -> None:
-    """Draw measured values over the number of processes, hollow where these share `cores` cores.
+    """Draw measured values over the number of processes, hollow if the processes share `cores` cores.
 
     Args:
-        axes: Where.
-        values: Of each number of processes.
-        cores: Of the machine.
+        axes: Axes to draw on.
+        values: Number of processes -> value.
+        cores: Cores of the machine.
         look: Colour, marker and name.
     """
     colour, marker, name = look

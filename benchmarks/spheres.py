@@ -1,9 +1,9 @@
-"""Milliseconds of a control step among hundreds of spheres, by the strips and by `renderer=spheres`.
+"""Measure a control step among hundreds of spheres, with `renderer=raycast` and with `renderer=spheres`.
 
 Run: python -m benchmarks.spheres
 Expect: a table in about a minute on one core. All rows fly the same point mass at 10 m/s, 5 m above the
-ground, in the same worlds; in each round they take turns. Which of two spheres that overlap the strips draw
-depends on the column that they begin with, so they also see events that are none.
+ground, in the same worlds, in interleaved rounds. Which of two overlapping spheres `raycast` draws depends
+on the column in which its strip begins, so it also produces false events.
 """
 
 from functools import partial

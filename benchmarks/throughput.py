@@ -1,8 +1,8 @@
-"""Steps per second of every station from the scene to the training loop, in one run.
+"""Measure steps per second of every stage from the scene to the training loop, in one run.
 
 Run: python -m benchmarks.throughput
-Expect: a table in about three minutes on one core. Rows of the second part hold everything
-that the rows above them do; "of the loop" is their time as a share of the training loop's.
+Expect: a table in about three minutes on one core. Rows of the second part include everything
+that the rows above them do; "of the loop" is the share of the training loop's time.
 """
 
 import subprocess
@@ -41,7 +41,7 @@ POLICY = "bytestream-s0"
 
 
 def main() -> None:
-    """Measure and print both tables."""
+    """Measure and print the table."""
     torch.set_num_threads(1)
     torch.manual_seed(0)
     evae = EventVAE.of(evae_settings(composed())).freeze()
@@ -58,7 +58,7 @@ def main() -> None:
 
 
 def frame_rows() -> list[tuple[str, float]]:
-    """Seconds per frame of each renderer, and per step of the event camera alone."""
+    """Return seconds per frame of each renderer, and per step of the event camera alone."""
     scene = make_scene("poles", np.random.default_rng(0))
     path_m = np.linspace(0.0, 90.0, 200)
     raycast = RaycastRenderer(scene, 64, 64)
@@ -82,7 +82,7 @@ def frame_rows() -> list[tuple[str, float]]:
 
 
 def _pyrender(scene: Scene) -> PyrenderRenderer | None:
-    """The OpenGL renderer, or None (and a line that says why) where it cannot run."""
+    """Return the OpenGL renderer; None if it cannot run, and print the reason."""
     try:
         return PyrenderRenderer(scene, 64, 64)
     except RuntimeError as error:
@@ -91,7 +91,7 @@ def _pyrender(scene: Scene) -> PyrenderRenderer | None:
 
 
 def step_rows(evae: EventVAE) -> list[tuple[str, float]]:
-    """Seconds per environment step: alone, with pyrender, as a vector, with the encoder, with a policy."""
+    """Return seconds per environment step: alone, with pyrender, as a vector, with encoder, with policy."""
     table, policy = EncoderTable.from_evae(evae), load_policy(PRETRAINED / POLICY)
     steps, batches = 416, 416 // NUM_ENVS
     rng = np.random.default_rng(0)
@@ -129,7 +129,7 @@ def step_rows(evae: EventVAE) -> list[tuple[str, float]]:
 
 
 def loop_rows(evae: EventVAE, folder: Path) -> list[tuple[str, float]]:
-    """Seconds per environment step of sampling, and of whole PPO iterations."""
+    """Return seconds per environment step of whole PPO iterations, and of sampling."""
     from jobs.run.ray_cluster import start_ray
     from jobs.training.algorithms import build_algorithm
     from jobs.training.sampling.env_runner import PlainEnvRunner
@@ -156,7 +156,7 @@ def loop_rows(evae: EventVAE, folder: Path) -> list[tuple[str, float]]:
 
 
 def composed(*words: str) -> Config:
-    """Words of the command line as the launcher composes them; without any, a training by PPO."""
+    """Return the configuration that the launcher composes from words; without words, a training by PPO."""
     given = {_key(word) for word in words}
     usual = [word for word in ("+exp=train", "algo=ppo") if _key(word) not in given]
     command = [sys.executable, "-m", "platform.launch", *usual, *words, "--cfg", "job"]

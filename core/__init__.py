@@ -1,4 +1,4 @@
-"""What `envs` and `models` share: pixel values, the neighbour filter, files, how kernels are compiled.
+"""Code shared by `envs` and `models`: pixel values, the neighbour filter, files, compiler settings.
 
 `envs` and `models` may not import each other; both import this package, which imports neither. Importing the
 package itself does not import numba.

@@ -1,4 +1,4 @@
-"""Where numba keeps compiled kernels if it may write neither beside the sources nor in the user's home."""
+"""Choose numba's cache folder if neither the folder of the sources nor the user's home is writable."""
 
 import hashlib
 import os
@@ -14,8 +14,8 @@ ROOMS = ("core", "envs", "models")
 def choose_cache(folder: Path) -> None:
     """Set NUMBA_CACHE_DIR to a private temporary folder, unless numba has a better place.
 
-    An installation that root owns, used without a home that can be written (docker run --user, Kubernetes),
-    leaves numba no place: numba would raise an error, or fill a folder named `~`. Child processes inherit the
+    If root owns the installation and the home is not writable (docker run --user, Kubernetes), numba has no
+    place for its cache: it would raise an error, or fill a folder named `~`. Child processes inherit the
     choice.
 
     Args:
@@ -31,7 +31,7 @@ def choose_cache(folder: Path) -> None:
 
 
 def _home_is_usable() -> bool:
-    """Whether the user's cache folder, or the nearest folder above it that exists, can be written."""
+    """Whether the user's cache folder, or its nearest existing parent, is writable."""
     home = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")  # noqa: PTH111, PTH118
     path = Path(home)
     if not path.is_absolute():
@@ -41,7 +41,7 @@ def _home_is_usable() -> bool:
 
 
 def _private_folder() -> Path:
-    """Return a temporary folder that only this user can enter: numba unpickles what it finds in its cache."""
+    """Return a temporary folder private to this user, because numba unpickles the files in its cache."""
     folder = Path(tempfile.gettempdir(), f"evade-{os.getuid()}")
     folder.mkdir(mode=0o700, exist_ok=True)
     info = folder.lstat()
@@ -51,6 +51,6 @@ def _private_folder() -> Path:
 
 
 def _digest(folder: Path) -> str:
-    """Return a hash of the kernels' sources: numba notices a changed file, but not a changed callee."""
+    """Return a hash of the kernels' sources. numba itself does not notice a changed callee."""
     files = sorted(path for room in ROOMS for path in (folder / room).rglob("*.py"))
     return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()[:12]

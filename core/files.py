@@ -10,7 +10,7 @@ from pathlib import Path
 def replaced(path: Path) -> Iterator[Path]:
     """Yield a path to write to; the file takes its final name when the block ends without an error.
 
-    This holds on the disk too: the content is stored before its name, and a full disk leaves the old file.
+    The content is flushed to the disk before the rename, so a crash or a full disk leaves the old file.
     """
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
@@ -26,7 +26,7 @@ def replaced(path: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Let an error of the operating system name the file: that of a write alone does not."""
+    """Add the file's name to an operating system error that lacks it, such as an error of `write`."""
     try:
         yield
     except OSError as error:

@@ -15,7 +15,10 @@ NEVER = -(2**62)  # earlier than any time minus any tau
 
 
 def quiet_sensor(width: int, height: int) -> np.ndarray:
-    """When each pixel last fired: never. int64 (height + 2, width + 2) [us], with a rim that cannot fire."""
+    """Return the last firing time of each pixel of a sensor that has never fired.
+
+    int64 (height + 2, width + 2) [us], including a rim of one pixel that cannot fire.
+    """
     return np.full((height + 2, width + 2), NEVER, np.int64)
 
 
@@ -23,11 +26,11 @@ def filter_neighbours(events: np.ndarray, last_us: np.ndarray, support: int, tau
     """Return the events that pass, in their order.
 
     Args:
-        events: Events with fields t [us], x, y, in time order and within the sensor; t >= 0 and not before
-            the events of earlier calls.
+        events: Events with fields t [us], x, y, in time order and within the sensor; t >= 0 and not earlier
+            than the events of previous calls.
         last_us: From `quiet_sensor` at the start of an episode; updated in place.
         support: Neighbours needed, 0 to 8; 0 passes every event and does not update `last_us`.
-        tau_us: How long ago they may have fired [us], at least 0.
+        tau_us: Maximum age of a neighbour's last event [us], at least 0.
 
     Raises:
         ValueError: `support` or `tau_us` is out of its range.
@@ -44,17 +47,17 @@ def filter_neighbours(events: np.ndarray, last_us: np.ndarray, support: int, tau
 def filter_all(
     events: np.ndarray, ends: np.ndarray, last_us: np.ndarray, support: np.ndarray, tau_us: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """`filter_neighbours` of several sensors.
+    """Run `filter_neighbours` for several sensors.
 
     Args:
-        events: EVENT of all, sensor after sensor.
+        events: EVENT of all sensors, one sensor after the other.
         ends: int64 (B + 1,), sensor b has events ends[b] .. ends[b + 1] - 1.
-        last_us: int64 (B, height + 2, width + 2), as of `quiet_sensor`, brought up to date.
+        last_us: int64 (B, height + 2, width + 2), from `quiet_sensor`; updated in place.
         support: int64 (B,), in 0..8.
         tau_us: int64 (B,), >= 0.
 
     Returns:
-        EVENT of those that pass, and their ends.
+        EVENT of the events that pass, and their ends.
     """
     kept, new_ends, count = np.empty_like(events), np.zeros_like(ends), 0
     for b in range(support.size):
@@ -81,7 +84,7 @@ def passing(
 
 @numba.njit(cache=True, error_model="numpy")
 def is_supported(x: int, y: int, t_us: int, last_us: np.ndarray, support: int, tau_us: int) -> bool:
-    """Whether one event passes; it becomes the last of its pixel."""
+    """Whether one event passes. Stores its time as the last one of its pixel."""
     since_us, fired = t_us - tau_us, 0
     for row in range(y, y + 3):  # the rim shifts pixels by one
         for column in range(x, x + 3):

@@ -7,10 +7,10 @@ GREY_ON, GREY_OFF = 255, 125  # a pixel of an event image whose last event was O
 
 
 def grey_picture(luminance: np.ndarray) -> np.ndarray:
-    """Return linear luminance as a camera stores it: gamma 2.2, 8 bits, uint8 of the same shape.
+    """Convert linear luminance to a camera's 8-bit values (gamma 2.2): uint8 of the same shape.
 
-    The paper's policy gets 8-bit RGB images (appendix D.1.2). This world is grey: three equal channels would
-    hold no more than one. Luminance above 1, which is white, becomes white.
+    The paper's policy gets 8-bit RGB images (appendix D.1.2). This world is grey, so three equal channels
+    would add nothing. Luminance above 1 (white) is clipped.
 
     Raises:
         ValueError: The luminance is NaN or infinite.

@@ -1,10 +1,10 @@
-"""Objects by the place where they stand: "module:attribute", as tables of plug-ins hold them."""
+"""Look up objects by references "module:attribute", as used in the tables of plug-ins."""
 
 import importlib
 from typing import Any
 
 
 def resolve(reference: str) -> Any:
-    """Return the object of a "module:attribute"; the module is imported only now."""
+    """Import the module of a reference "module:attribute" and return the attribute."""
     module, _, name = reference.partition(":")
     return getattr(importlib.import_module(module), name)

@@ -1,4 +1,4 @@
-"""Compiled kernels that are older than their sources."""
+"""Delete compiled kernels that are older than their sources."""
 
 import contextlib
 import hashlib
@@ -18,17 +18,17 @@ def forget_stale_kernels(folder: Path, *used: Path) -> None:
 
     The sources of a kernel are its file, the files of its package that this file imports, directly or not,
     and this package. numba checks the kernel's own file alone: after an edit of a kernel that it calls, or of
-    an argument's type, numba would run the old machine code. numba also writes the name of a kernel
-    before the kernel: a full disk or a kill in between would leave the new name with the old machine code.
+    an argument's type, numba would run the old machine code. numba also writes a kernel's index entry
+    before the kernel: a full disk or a kill in between would leave the new entry with the old machine code.
     And numba raises an error if a file is empty or truncated.
 
     Args:
         folder: The package, such as `envs`. Its `__pycache__/kernels.json` holds the hashes of the sources.
-        used: Other packages; an edit in one of them concerns every kernel of `folder`.
+        used: Other packages. An edit in any of them invalidates every kernel of `folder`.
     """
     index = folder / "__pycache__" / INDEX
     now = _digests(folder, (Path(__file__).parent, *used))
-    # Another process may be faster, or the folder not ours: numba then decides.
+    # Another process may have deleted a file first, or the folder may be read-only: then leave it to numba.
     with contextlib.suppress(OSError):
         try:
             before = json.loads(index.read_bytes())
@@ -65,7 +65,7 @@ def _digests(folder: Path, used: Sequence[Path]) -> dict[str, str]:
 
 
 def _imports(folder: Path, text: str) -> set[Path]:
-    """Return the files that the import statements of a text may name."""
+    """Return the files that the import statements of a source text may refer to."""
     modules: set[str] = set()
     for module, names in re.findall(IMPORT.format(folder.name), text):
         modules.update((module, *(f"{module}.{name}" for name in re.findall(r"\w+", names))))
@@ -74,7 +74,7 @@ def _imports(folder: Path, text: str) -> set[Path]:
 
 
 def _is_whole(compiled: Path) -> bool:
-    """Whether a pickle file has its end; a missing file counts as whole."""
+    """Whether a pickle file is complete; a missing file counts as complete."""
     with contextlib.suppress(FileNotFoundError), compiled.open("rb") as file:
         try:
             file.seek(-1, os.SEEK_END)

@@ -1,4 +1,4 @@
-"""One target for compiled kernels, so that a cache made once serves every machine of its class."""
+"""Compile kernels for one fixed target, so that one cache serves every machine of that class."""
 
 import os
 import sys
@@ -6,22 +6,22 @@ import sysconfig
 import warnings
 from pathlib import Path
 
-# The processor's name and extra features, as LLVM calls them. An empty list means those of the name.
+# Processor name and extra features in LLVM's spelling. Without extra features the name implies all of them.
 TARGETS = {"x86_64": ("x86-64-v3", ""), "aarch64": ("generic", "+neon"), "arm64": ("generic", "+neon")}
 NAME, FEATURES = "NUMBA_CPU_NAME", "NUMBA_CPU_FEATURES"
-# What x86-64-v3 has and older processors lack, as Linux calls it.
+# Features that x86-64-v3 adds, in Linux's spelling.
 X86_64_V3 = frozenset({"abm", "avx2", "bmi1", "bmi2", "f16c", "fma", "movbe"})
 
 
 def fix_target(processors: Path = Path("/proc/cpuinfo")) -> None:
-    """Let numba compile for x86-64-v3, or for Armv8 with NEON, whatever processor this machine has.
+    """Make numba compile for x86-64-v3, or for Armv8 with NEON, whatever processor this machine has.
 
-    numba would take this processor with all its features: other machines could not load what it compiled,
-    and wider vectors add in another order, where a kernel allows that. NUMBA_CPU_NAME or NUMBA_CPU_FEATURES
-    of the user take precedence. Processes that this one starts inherit the choice.
+    By default numba uses all features of this processor. Other machines could then not load the kernels, and
+    wider vectors would change the order of sums in kernels that allow it. NUMBA_CPU_NAME and
+    NUMBA_CPU_FEATURES take precedence if the user sets one. Child processes inherit the choice.
 
     Args:
-        processors: The file in which Linux describes its processors.
+        processors: The file in which Linux lists the processors.
 
     Raises:
         RuntimeError: The processor is older than x86-64-v3.
@@ -48,7 +48,7 @@ def fix_target(processors: Path = Path("/proc/cpuinfo")) -> None:
 
 
 def _lacking(processors: Path) -> list[str]:
-    """Features of x86-64-v3 that the first processor of a list lacks; none where there is no list."""
+    """Return the features of x86-64-v3 that the first listed processor lacks; empty if there is no list."""
     try:
         text = processors.read_text()
     except OSError:
@@ -58,6 +58,6 @@ def _lacking(processors: Path) -> list[str]:
 
 
 def _has_compiled() -> bool:
-    """Whether numba has set up its compiler in this process, whose target is fixed from then on."""
+    """Whether numba has already set up its compiler in this process, which fixes the target."""
     registry = sys.modules.get("numba.core.registry")
     return registry is not None and "_toplevel_target_context" in vars(registry.cpu_target)

@@ -1,6 +1,6 @@
-"""A headless Chromium, and the dashboard that it opens; for tests and for the pictures of the documentation.
+"""Open the dashboard in a headless Chromium, for tests and for the pictures of the documentation.
 
-The browser is driven over its debugging pipe, which needs no package; it reaches this machine alone.
+The browser is controlled through its debugging pipe, which needs no package. It can reach this machine only.
 """
 
 import base64
@@ -26,13 +26,13 @@ FLAGS = (
 )  # fmt: skip
 ERRORS = ("Runtime.exceptionThrown", "Runtime.consoleAPICalled", "Log.entryAdded")
 PATIENCE_S = 300.0  # a busy machine takes minutes to start the server
-# What covers a quarter of each page until it is closed once.
+# Closes MLflow's assistant, which otherwise covers a quarter of each page.
 NO_ASSISTANT = "localStorage.setItem('mlflow.assistant.fab.autoOpenedOnFirstLoad_v1', 'true')"
 
 
 @contextlib.contextmanager
 def served(uri: str, bin_folder: Path) -> Iterator[str]:
-    """Serve a store on a free port, by the command that the jobs print; yields the address."""
+    """Serve a store on a free port with the command that the jobs print; yield the address."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -63,7 +63,7 @@ def _healthy(address: str) -> bool:
 
 
 def wait_for(condition: Any, what: str) -> None:
-    """Ask until a condition holds."""
+    """Wait until a condition is true; raise TimeoutError after `PATIENCE_S`."""
     end = time.monotonic() + PATIENCE_S
     while not condition():
         if time.monotonic() > end:
@@ -72,10 +72,10 @@ def wait_for(condition: Any, what: str) -> None:
 
 
 class Browser:
-    """One window of a headless Chromium."""
+    """A window of a headless Chromium."""
 
     def __init__(self, profile: Path, width: int = 1600, height: int = 1200) -> None:
-        """Start it; `profile` is an empty folder."""
+        """Start the browser; `profile` is an empty folder."""
         (their_in, self.out), (self.into, their_out) = os.pipe(), os.pipe()
 
         def give_pipes() -> None:
@@ -91,10 +91,10 @@ class Browser:
             os.close(end)
         self.size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
         self.number, self.session, self.buffer = 0, None, b""
-        self.errors: list[str] = []  # that the pages have logged
+        self.errors: list[str] = []  # logged by the pages
 
     def close(self) -> None:
-        """End it."""
+        """End the browser."""
         self.process.terminate()
         self.process.wait(30)
         os.close(self.out)
@@ -146,7 +146,7 @@ class Browser:
         return self.text()
 
     def text(self) -> str:
-        """What the page shows as text."""
+        """Return the text that the page shows."""
         return self.evaluate("document.body ? document.body.innerText : ''") or ""
 
     def wait(self, script: str, what: str) -> bool:
@@ -155,11 +155,11 @@ class Browser:
         return True
 
     def evaluate(self, script: str) -> Any:
-        """The value of an expression on the page."""
+        """Return the value of an expression on the page."""
         return self.call("Runtime.evaluate", expression=script, returnByValue=True)["result"].get("value")
 
     def click(self, text: str) -> None:
-        """Click what shows exactly this text."""
+        """Click the element that shows exactly this text."""
         every = "[...document.querySelectorAll('button, a, span, div')]"
         find = f"{every}.find(e => e.innerText === {json.dumps(text)})"
         wait_for(lambda: self.evaluate(f"!!{find}"), text)
@@ -171,5 +171,5 @@ class Browser:
             self.call("Input.dispatchKeyEvent", type=kind, key=key)
 
     def picture(self) -> bytes:
-        """What the window shows, as a PNG."""
+        """Return a screenshot of the window, as a PNG."""
         return base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])

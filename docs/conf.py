@@ -1,4 +1,4 @@
-"""Sphinx: the pages, the keys of the configuration from the schema, and the API from the docstrings."""
+"""Configure Sphinx: pages, keys of the configuration from the schema, and the API from docstrings."""
 
 import dataclasses
 import re
@@ -30,12 +30,12 @@ autodoc_mock_imports = ["ray", "mlflow"]
 autodoc_typehints_format = "short"
 maximum_signature_line_length = 80
 napoleon_use_ivar = True
-html_extra_path = ["replay.html", "films"]  # written by commands, as the figures are
+html_extra_path = ["replay.html", "films"]  # written by commands, like the figures
 exclude_patterns = ["_build", "_templates"]
 
 
 def _skip_fields(_app, _what, _name, member, skip, _options):
-    """Whether to leave a member out: fields of a NamedTuple, which its docstring describes; validators."""
+    """Whether to leave out a member: a validator, or a field of a NamedTuple, which its docstring covers."""
     return (
         skip
         or isinstance(member, classmethod)
@@ -44,9 +44,9 @@ def _skip_fields(_app, _what, _name, member, skip, _options):
 
 
 def _escape(_app, _what, _name, _obj, _options, lines):
-    """Bars and stars of formulas as they are: docstrings have no reST markup but backquotes.
+    """Escape bars and stars of formulas, because docstrings have no reST markup except backquotes.
 
-    An entry for several attributes becomes one with a single name, which napoleon can read.
+    An entry for several attributes gets a single name, because napoleon cannot read several.
     """
     several = re.compile(r"^( {4}\w+)((?:, \w+)+): ")
     lines[:] = [several.sub(lambda found: f"{found[1]}: (also{found[2][1:]}) ", line) for line in lines]
@@ -54,12 +54,12 @@ def _escape(_app, _what, _name, _obj, _options, lines):
 
 
 def _drop_types(_app, _what, _name, obj, _options, _signature, _returned):
-    """No signature for settings: what each field may be is said in words."""
+    """Remove the signature of settings, whose allowed values `_say_types` describes in words."""
     return ("", None) if _is_settings(obj) else None
 
 
 def _say_types(_app, _what, _name, obj, _options, lines):
-    """What each field of a class of settings may be, in words."""
+    """Append the allowed values of each field of a settings class, in words."""
     if _is_settings(obj):
         hints = typing.get_type_hints(obj, include_extras=True)
         lines += ["", "Allowed values:", ""]
@@ -72,7 +72,7 @@ def _is_settings(obj):
 
 
 def _fill_in(app, docname, source):
-    """Add the contents to the pages that head them; lead the table of modules to the site's own pages."""
+    """Add the contents to their pages; let the table of modules link to the site's own pages."""
     there = app.env.found_docs
     if docname == "index":
         trees = [
@@ -86,12 +86,12 @@ def _fill_in(app, docname, source):
 
 
 def _read_again(*_):
-    """The contents, which depend on what other pages there are."""
+    """Return the pages with contents, which depend on the other pages that exist."""
     return ["index", *BELOW]
 
 
 def setup(app):
-    """Called by Sphinx."""
+    """Connect the functions above to Sphinx, which calls this."""
     app.connect("autodoc-skip-member", _skip_fields)
     app.connect("autodoc-process-signature", _drop_types)
     app.connect("autodoc-process-docstring", _escape, priority=400)  # before napoleon

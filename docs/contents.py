@@ -1,6 +1,6 @@
-"""The contents of the site: the groups of the sidebar, and the pages of each.
+"""The contents of the site: groups of the sidebar and their pages.
 
-A page that is not there is left out: commands write some of them.
+Pages that do not exist are left out, because some are written by commands.
 """
 
 from pathlib import Path
@@ -18,7 +18,7 @@ CONTENTS = {
     "Project": ("differences", "security", "citation"),
 }  # fmt: skip
 PLANS = sorted((Path(__file__).parent / "plans").glob("*.md"))
-# A page of the sidebar -> pages below it, which it lists itself.
+# Page of the sidebar -> the pages below it.
 BELOW = {
     "studies": (
         "dose_response_taught", "ppo_paper", "ppo_event_set", "encoder_seeds", "camera_rates", "ablation",

@@ -20,7 +20,7 @@ FRAMES, FRAME_US = 60, 1000
 
 
 def main() -> None:
-    """One pixel in both memory modes."""
+    """Draw one pixel in both memory modes."""
     time_ms = np.arange(FRAMES) * FRAME_US / 1000
     light = 0.35 + 0.3 * np.sin(time_ms / 9.0) * np.exp(-time_ms / 60.0) + 0.1 * (time_ms > 40)
     figure, axes = plt.subplots(1, 2, figsize=(10, 3.4), sharey=True, layout="constrained")
@@ -34,7 +34,7 @@ def main() -> None:
 
 
 def draw_pixel(ax: plt.Axes, time_ms: np.ndarray, light: np.ndarray, memory: str) -> None:
-    """The light of a pixel, the levels a threshold apart, and its events."""
+    """Draw the light of a pixel, levels one threshold apart, and the pixel's events."""
     camera = EventCamera(CameraConfig(width=1, height=1, contrast_threshold=0.15, memory=memory))
     frames = light.astype(np.float32).reshape(-1, 1, 1)
     camera.reset(frames[0], 0)

@@ -1,9 +1,9 @@
-"""Roll out shipped policies for docs/watch.md, and keep the films small.
+"""Film shipped policies for docs/watch.md, in small files.
 
 Run from the repository root: python -m docs.draw_films [NAME ...]
 Writes docs/films/NAME.mp4, 720 pixels wide, and docs/images/demo.gif for
-the README. Every film is one corridor, the first (seed 0), whatever happens in it; those of `FAILURES`
-the first in which the policy fails. `corruptions` shows the corruptions of the benchmark
+the README. Every film shows the first corridor (seed 0), whatever happens in it; those in `FAILURES` show
+the first corridor in which the policy fails. `corruptions` shows the corruptions of the benchmark
 at severity 5: camera and events. Expect 7 minutes.
 """
 
@@ -54,7 +54,7 @@ FAILURES = {
 }
 CORRUPTIONS, SEVERITY, SHOWN_S, SHOWN_FPS = "corruptions", 5, 0.8, 10.0
 ACROSS, SIDE, LINE, GAP = 3, 128, 20, 8  # corruptions in a row; pixels of a panel, a name and a gap
-AT_ONCE, CORRIDORS = 20, 100  # in which a failure is looked for
+AT_ONCE, CORRIDORS = 20, 100  # corridors in which a failure is searched
 # 10 frames a second at the speed of the demo, whatever its own rate; the last frame stays.
 SMALL = ("-vf", "tpad=stop_mode=clone:stop_duration=0.3,fps=10,scale=720:-2", "-crf", "33", "-an")
 MOVING = (
@@ -64,7 +64,7 @@ MOVING = (
 
 
 def main() -> None:
-    """Make the films that the command line names, or all."""
+    """Create the films that the command line names, or all."""
     (DOCS / "films").mkdir(exist_ok=True)
     ffmpeg = imageio_ffmpeg.get_ffmpeg_exe()
     for name in sys.argv[1:] or (*FILMS, *FAILURES, CORRUPTIONS):
@@ -89,10 +89,10 @@ def main() -> None:
 
 
 def first_failure(words: Sequence[str]) -> int:
-    """The first held-out corridor in which a demo of these words shows a failure.
+    """Return the seed of the first held-out corridor in which the demo with these words fails.
 
     Raises:
-        LookupError: There is none among the first `CORRIDORS`.
+        LookupError: The policy fails in none of the first `CORRIDORS`.
     """
     _, env, agent = find_shown(composed("+exp=demo", *words))
     for first in range(0, CORRIDORS, AT_ONCE):
@@ -104,7 +104,7 @@ def first_failure(words: Sequence[str]) -> int:
 
 
 def draw_corruptions() -> None:
-    """Film the start of the first corridor under each corruption of the sensor, as one policy flies it."""
+    """Film the start of one policy's flight in the first corridor, under each corruption of the sensor."""
     policy = read_policy(str(PRETRAINED / "bytestream_hold-s0"))
     found = {
         name: group[0].env

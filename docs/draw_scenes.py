@@ -32,7 +32,7 @@ SEED, CORRIDORS = 1, 200
 
 
 def main() -> None:
-    """Draw the scenes named on the command line, or all, and measure those that are layouts."""
+    """Draw the scenes named on the command line, or all, and print the measurements of layouts."""
     names = sys.argv[1:] or [*(name for name in LAYOUTS if name != "spheres"), "mesh"]
     sys.stdout.write("scene: passable at the first draw, straight flights colliding, drawing, search [ms]\n")
     for name in names:
@@ -46,14 +46,14 @@ def main() -> None:
 
 
 def draw(scene: Scene) -> Image.Image:
-    """The three panels side by side, on a palette of `COLOURS` colours."""
+    """Return the three panels of a scene side by side, on a palette of `COLOURS` colours."""
     x, y = viewpoint(scene)
     renderer = RaycastRenderer if scene.mesh is None else PyrenderRenderer
     above = renderer(scene, 2 * SIZE, 2 * SIZE).render(*ABOVE_M)[-SIZE - 32 : -32, SIZE // 2 : -SIZE // 2]
     panels = [grey(above), grey(renderer(scene, SIZE, SIZE).render(x, y, HEIGHT_M))]
     small = renderer(scene, 64, 64)
     camera = EventCamera(CameraConfig())
-    for step in range(-STEPS, 1):  # a few steps earlier, so that each pixel has its own level
+    for step in range(-STEPS, 1):  # start a few steps earlier, so that each pixel has its own level
         luminance = small.render(x, y + step * STEP_M, HEIGHT_M, 0.0, (step + STEPS) * STEP_US * 1e-6)
         if step == -STEPS:
             camera.reset(luminance, 0)
@@ -67,13 +67,13 @@ def draw(scene: Scene) -> Image.Image:
 
 
 def grey(luminance: np.ndarray) -> np.ndarray:
-    """Linear luminance (H, W) as uint8 (H, W, 3)."""
+    """Return linear luminance (H, W) as a grey picture, uint8 (H, W, 3)."""
     shade = np.clip(255.0 * np.sqrt(luminance), 0, 255).astype(np.uint8)
     return np.repeat(shade[:, :, None], 3, axis=2)
 
 
 def viewpoint(scene: Scene) -> tuple[float, float]:
-    """A position with an obstacle near ahead, but not in the way [m]."""
+    """Return a position [m] with an obstacle close ahead, but not on the path."""
     for y in np.arange(8.0, 40.0, 1.0):
         for x in (0.0, -2.0, 2.0, -4.0, 4.0):
             near = scene.collides((x - 2.5, y + 4.0), (x + 2.5, y + 4.0), 0.5, HEIGHT_M)
@@ -83,7 +83,7 @@ def viewpoint(scene: Scene) -> tuple[float, float]:
 
 
 def example_mesh(folder: str) -> str:
-    """A file with a ring, a ball and two towers, as a modelling tool would write it."""
+    """Write a mesh file with a ring, a ball and two towers, as a modelling tool would; return its path."""
     scene = trimesh.Scene()
     ring = trimesh.creation.torus(2.5, 0.4)
     ring.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, (1, 0, 0)))
@@ -103,7 +103,7 @@ def example_mesh(folder: str) -> str:
 
 
 def measurements(name: str) -> str:
-    """The row of a scene: share of passable corridors, share of collisions, times; over `CORRIDORS` seeds."""
+    """Return a scene's row, over `CORRIDORS` seeds: passable corridors and collisions [%], times [ms]."""
     starts = np.random.default_rng(0)
     passable = hits = 0
     drawing, checking = [], []

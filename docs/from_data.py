@@ -1,9 +1,9 @@
-"""Make the result pages and their figures again from docs/data alone: no run folder and no store is needed.
+"""Regenerate the result pages and their figures from docs/data alone, without run folders or a store.
 
 Run from the repository root: python -m docs.from_data [FOLDER]
 Fills the marks of every page in docs (`<!-- study NAME PART -->`, see jobs.study.page), writes the estimates
-and changes of each study, and draws each figure whose data are there, into FOLDER with `data` and `images`;
-by default docs. docs/data.md explains the data.
+and changes of each study, and draws each figure whose data exist. The output goes to FOLDER (by default docs)
+and its folders `data` and `images`. docs/data.md explains the data.
 """
 
 import csv
@@ -29,7 +29,7 @@ from jobs.study.report import filled_pages, study_of, write_figures, write_value
 from jobs.tools.curves import PublishedTraining, by_reward, published_trainings, read_curves
 
 DOCS = Path(__file__).resolve().parent
-# Studies whose pages have no marks: study -> its data, with a figure of their name each.
+# Studies whose pages have no marks: name of the data and of the figure -> study.
 UNMARKED = {
     "ablation": "ablation",
     "ablation_more": "ablation",
@@ -39,7 +39,7 @@ UNMARKED = {
 
 
 def studies(docs: Path) -> dict[str, Study]:
-    """Return name -> each study that pages show and whose data are there."""
+    """Return name -> study, for each study that pages show and whose data exist."""
     marks = marked(page.read_text() for page in sorted(docs.glob("*.md")))
     marks += [spec if data == spec else f"{spec}:{data}" for data, spec in UNMARKED.items()]
     named = {mark.partition(":")[2] or mark: mark for mark in marks}
@@ -49,7 +49,7 @@ def studies(docs: Path) -> dict[str, Study]:
 
 
 def study_figures(found: Mapping[str, Study]) -> dict[str, Figure]:
-    """Return name -> each figure of the studies; of one that takes another's file, under its own name."""
+    """Return name -> figure of the studies; in `UNMARKED`, the figure has the name of the data."""
     drawn: dict[str, Figure] = {}
     for name, study in found.items():
         own = figures(study)
@@ -58,7 +58,7 @@ def study_figures(found: Mapping[str, Study]) -> dict[str, Figure]:
 
 
 def other_figures(data: Path) -> dict[str, Figure]:
-    """Return name -> each figure of measurements whose data are there."""
+    """Return name -> figure, for each measurement whose data exist."""
     found: dict[str, Figure] = {}
     if (data / "trade_settings.csv").is_file():
         with (data / "trade_settings.csv").open() as file:
@@ -94,8 +94,8 @@ def main(docs: Path, target: Path) -> None:
     """Write pages, figures, estimates and changes.
 
     Args:
-        docs: Where the data and the pages are.
-        target: Where pages go, figures into `images`, estimates and changes into `data`.
+        docs: Folder of the pages, with `data`.
+        target: Folder for the pages, with `images` for figures and `data` for estimates and changes.
     """
     found = studies(docs)
     drawn = study_figures(found) | other_figures(docs / "data")

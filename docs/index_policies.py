@@ -1,7 +1,7 @@
 """Write docs/data/policies.json, the index of the policies that studies have published.
 
 Run: python -m docs.index_policies
-Expect: seconds. A row holds study, name and kind of a policy, the seed of its training, its folder, and the
+Expect: seconds. A row has the study, name and kind of a policy, the seed of its training, its folder, and the
 SHA-256 of the folder's files.
 """
 

@@ -1,6 +1,6 @@
-"""Every key of a configuration, as the tables of docs/keys.md.
+"""Generate the tables of docs/keys.md, with every key of a configuration.
 
-What a key may be comes from the schema; its default, unit, meaning and source from conf/ and its comments.
+Allowed values come from the schema; defaults, units, meanings and sources from conf/ and its comments.
 """
 
 import dataclasses
@@ -22,7 +22,7 @@ from jobs.config.registry import JOBS, Job
 from models.kinds import EncoderModel
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
-FILES = {  # where the comments stand: the section that a file begins in
+FILES = {  # files with comments: the section of their top level
     "config.yaml": "", "budget/short.yaml": "", "env/corridor.yaml": "env", "camera/paper.yaml": "camera",
     "faults/none.yaml": "faults", "fidelity/tolerance.yaml": "fidelity", "model/bytestream.yaml": "model",
     "algo/ppo.yaml": "algo", "algo/imitation.yaml": "algo",
@@ -39,7 +39,7 @@ BOUNDS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
 
 
 class Row(typing.NamedTuple):
-    """One key as texts."""
+    """A row of a table: the texts about one key."""
 
     key: str
     default: str
@@ -50,7 +50,7 @@ class Row(typing.NamedTuple):
 
 
 def allowed(kind: object) -> str:
-    """What values a type takes, in words: "whole number, at least 1, or null"."""
+    """Return the values that a type allows, in words: "whole number, at least 1, or null"."""
     origin, inner = typing.get_origin(kind), typing.get_args(kind)
     if origin is typing.Annotated:
         limits = [limit for part in inner[1:] for limit in _limits(part)]
@@ -67,7 +67,7 @@ def allowed(kind: object) -> str:
 
 
 def _limits(part: object) -> Iterator[str]:
-    """The bounds that a pydantic field sets; others say nothing."""
+    """Yield the bounds that a part of a pydantic annotation sets."""
     for rule in getattr(part, "metadata", None) or ([part] if not hasattr(part, "metadata") else []):
         for name, text in BOUNDS.items():
             if (bound := getattr(rule, name, None)) is not None:
@@ -75,7 +75,7 @@ def _limits(part: object) -> Iterator[str]:
 
 
 def comments(file: Path, section: str) -> dict[str, str]:
-    """The comment behind each key of a YAML file."""
+    """Return key -> comment on the same line, for each key of a YAML file that has one."""
     found, path = {}, [(-1, section)]
     for line in file.read_text().splitlines():
         match = LINE.match(line)
@@ -89,7 +89,7 @@ def comments(file: Path, section: str) -> dict[str, str]:
 
 
 def documented(cls: type) -> dict[str, str]:
-    """What the docstring of a dataclass says of its fields."""
+    """Return field -> text about it in the docstring of a dataclass."""
     listed = inspect.cleandoc(cls.__doc__ or "").partition("Attributes:\n")[2]
     entries = re.findall(r"^    (\w[\w, ]*): (.*(?:\n {8}.*)*)", listed, re.MULTILINE)
     return {name: " ".join(text.split()) for names, text in entries for name in names.split(", ")}
@@ -97,7 +97,7 @@ def documented(cls: type) -> dict[str, str]:
 
 @cache
 def _said() -> Mapping[str, str]:
-    """What is said of each key: the first comment in conf/."""
+    """Return key -> first comment about it in conf/."""
     found: dict[str, str] = {}
     files = FILES | {f"job/{name}.yaml": "" for name in JOBS}
     for name, section in files.items():
@@ -119,7 +119,7 @@ def _defaults() -> Mapping[str, object]:
 
 
 def row(key: str, kind: object, fallback: str = "") -> Row:
-    """What there is to say about a key; `fallback`: its meaning if conf/ has no comment on it."""
+    """Return the row of a key; `fallback` is its meaning if conf/ has no comment on it."""
     said = _said().get(key, "")
     unit, source = (", ".join(rule.findall(said)) for rule in (UNIT, SOURCE))
     meaning = SOURCE.sub("", UNIT.sub("", said)).strip(" ;,") or fallback
@@ -129,14 +129,14 @@ def row(key: str, kind: object, fallback: str = "") -> Row:
 
 
 def _as_yaml(value: object) -> str:
-    """A value as one writes it on the command line."""
+    """Return a value as written on the command line."""
     if value is None or isinstance(value, bool):
         return "null" if value is None else str(value).lower()
     return f"{value:g}" if isinstance(value, float) else str(value).replace("'", "")
 
 
 def kinds() -> dict[str, dict[str, tuple[object, str]]]:
-    """Type and documentation of all keys, by section; the one without a name holds what is in none."""
+    """Return type and documentation of all keys, by section; section "" has the keys outside of sections."""
     hints = typing.get_type_hints(Config, include_extras=True)
     del hints["own"]
     found: dict[str, dict[str, tuple[object, str]]] = {
@@ -171,7 +171,7 @@ def _field(owner: typing.Any, name: str) -> tuple[object, str]:
 
 
 def tables() -> str:
-    """All tables as Markdown."""
+    """Return all tables as Markdown."""
     text = []
     for section, keys in kinds().items():
         text += [

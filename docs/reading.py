@@ -1,8 +1,8 @@
 """Measure how well the pages read: words, sentence lengths, and Flesch's reading ease.
 
 Run from the repository root: python -m docs.reading [--check]
-Prints a row a page. With --check a page that breaks a limit stops it. Plans, which stay as they were written
-before the data, are in docs/plans and count apart.
+Prints one row per page. With --check the command fails if a page breaks a limit. The plans in docs/plans,
+which are not changed after the data, are counted separately.
 """
 
 import re
@@ -17,10 +17,10 @@ from docs.contents import CONTENTS, PLANS
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
-GENERATED = ("keys.md", "api.md", "changelog.md")  # tables of the schema, docstrings, the log of changes
+GENERATED = ("keys.md", "api.md", "changelog.md")  # from the schema, from docstrings, from the changelog
 FIRST = ("README.md", *(f"docs/{name}.md" for name in ("index", "start", "task", "train", "sweep", "models")))
 MOST_MEDIAN, MOST_WORDS, LEAST_EASE = 18, 35, 45.0  # median and longest sentence [words], reading ease
-MOST_WORDS_ANYWHERE = 40  # of a sentence on any page
+MOST_WORDS_ANYWHERE = 40  # longest sentence on any page [words]
 MOST_SITE_WORDS, MOST_LINKS = 32_000, 42
 BLOCKS = (
     re.compile(r"^(`{3,}|:{3,}).*?^\1\s*$", re.MULTILINE | re.DOTALL),  # code and directives
@@ -44,11 +44,11 @@ SENTENCE = re.compile(r"(?<=[.!?:])[*_)\"]*\s+(?=[\"(*_]*[A-Z0-9])|\n\s*\n")
 
 
 class Reading(NamedTuple):
-    """How a page reads.
+    """The readability of a page.
 
     Attributes:
         words: All words of the file, as `wc -w` counts.
-        median: Of the words of a sentence; 0 without a sentence.
+        median: Median words per sentence; 0 without a sentence.
         longest: Words of the longest sentence.
         ease: Flesch's reading ease; 100 without a sentence.
         sentence: The longest sentence.
@@ -72,7 +72,7 @@ def sentences(text: str) -> list[str]:
 
 
 def measure(text: str) -> Reading:
-    """Measure a page."""
+    """Measure the readability of a page."""
     found = sentences(text)
     if not found:
         return Reading(len(text.split()), 0, 0, 100.0, "")
@@ -85,7 +85,7 @@ def measure(text: str) -> Reading:
 def reading_ease(prose: list[str]) -> float:
     """Return Flesch's reading ease of sentences: 100 is easy, 30 is for graduates (Flesch 1948).
 
-    Syllables are those of a dictionary of hyphenation, which misses some, so that pages seem a little easier.
+    Syllables come from a hyphenation dictionary, which misses some, so that pages seem a little easier.
     """
     words = [word for one in prose for word in WORD.findall(one)]
     syllables = sum(1 + len(SYLLABLES.positions(word.lower())) for word in words)
@@ -93,7 +93,7 @@ def reading_ease(prose: list[str]) -> float:
 
 
 def broken(page: str, found: Reading) -> list[str]:
-    """Return what is wrong with one of the first pages, a line a limit."""
+    """Return one line for each limit that one of the first pages breaks."""
     wrong = []
     if found.median > MOST_MEDIAN:
         wrong.append(f"{page}: median sentence of {found.median:g} words; at most {MOST_MEDIAN}")
@@ -105,7 +105,7 @@ def broken(page: str, found: Reading) -> list[str]:
 
 
 def site_words() -> int:
-    """Return the words of the site: without keys, API and changelog, and without the plans of docs/plans."""
+    """Return the number of words of the site, without keys, API, changelog and the plans of docs/plans."""
     return sum(len(page.read_text().split()) for page in DOCS.glob("*.md") if page.name not in GENERATED)
 
 
@@ -115,7 +115,7 @@ def sidebar_links() -> int:
 
 
 def check() -> list[str]:
-    """Return what breaks a limit: sentences of the first pages and of any, words and links of the site."""
+    """Return one line for each broken limit: of the first pages, of any page, and of the whole site."""
     wrong = [line for page in FIRST for line in broken(page, measure((ROOT / page).read_text()))]
     for page in sorted(DOCS.glob("*.md")):
         if page.name not in GENERATED and (found := measure(page.read_text())).longest > MOST_WORDS_ANYWHERE:
@@ -128,7 +128,7 @@ def check() -> list[str]:
 
 
 def table() -> str:
-    """Return a row a page, and what the site has in all."""
+    """Return a table with one row per page, and the totals of the site."""
     pages = [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
     lines = [f"{'page':28}{'words':>8}{'median':>8}{'longest':>8}{'ease':>6}"]
     for page in pages:

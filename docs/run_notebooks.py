@@ -1,4 +1,4 @@
-"""Run the notebooks of docs/notebooks and keep what they print and draw.
+"""Run the notebooks of docs/notebooks and store their outputs.
 
 Run from the repository root: python -m docs.run_notebooks [NAME ...]
 """
@@ -16,14 +16,14 @@ TIMEOUT_S = 600  # of a cell, on a busy machine
 
 
 def execute(path: Path) -> nbformat.NotebookNode:
-    """The notebook with the outputs of a fresh run.
+    """Run a notebook and return it with its outputs.
 
     Raises:
         CellExecutionError: A cell failed.
     """
     notebook = nbformat.read(path, nbformat.NO_CONVERT)
     resources = {"metadata": {"path": str(path.parent)}}
-    with tempfile.TemporaryDirectory() as sockets:  # not TCP, which others on the machine could read
+    with tempfile.TemporaryDirectory() as sockets:  # not TCP, which other users of the machine could read
         files = Config({"KernelManager": {"transport": "ipc", "ip": f"{sockets}/kernel"}})
         client = NotebookClient(
             notebook, timeout=TIMEOUT_S, kernel_name="python3", resources=resources, config=files

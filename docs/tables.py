@@ -1,8 +1,8 @@
-"""Write the tables that code and data decide into the pages, so that GitHub shows them as the site does.
+"""Write the tables that are generated from code and data into the pages, so that GitHub shows them, too.
 
 Run from the repository root: python -m docs.tables [--check]
-Between `<!-- NAME -->` and `<!-- /NAME -->` of a page stands what the function of that name returns. With
---check nothing is written, and a page that lags behind stops it.
+The result of the function NAME is written between `<!-- NAME -->` and `<!-- /NAME -->` of a page. With
+--check nothing is written, and the command fails if a page is out of date.
 """
 
 import ast
@@ -48,7 +48,7 @@ MODULES = {
         "jobs.tracking.child_runs", "jobs.tracking.model_registry",
     ),
 }  # fmt: skip
-# Heading of the README's table -> the condition; then its rows: study and group -> how it is called.
+# Heading of the README's table -> the condition; then its rows: study and group -> name.
 CONDITIONS = {
     "nominal": ("nominal", "poles_eval"),
     "45 Hz": ("control_hz", "45"),
@@ -88,7 +88,7 @@ def api_table() -> str:
 
 
 def modules_page() -> str:
-    """Return the page from which the site makes a page of each module."""
+    """Return the page from which the site generates a page for each module."""
     blocks = [
         f"{section}\n{'-' * len(section)}\n\n.. autosummary::\n   :toctree: api\n\n"
         + "\n".join(f"   {module}" for module in modules)
@@ -111,7 +111,7 @@ def layer_table() -> str:
 def success_table() -> str:
     """Return the README's table: success [%] of some groups under some conditions, means over seeds.
 
-    Each group is that of the study with the most trainings and corridors.
+    Each group comes from its study with the most trainings and corridors.
     """
     rates: dict[tuple[str, ...], list[float]] = defaultdict(list)
     episodes: dict[str, str] = {}
@@ -130,7 +130,7 @@ def success_table() -> str:
 
 
 def bench_table() -> str:
-    """Return the leaderboard of part C of the benchmark, of the results in docs/data/bench."""
+    """Return the leaderboard of part C of the benchmark, from the results in docs/data/bench."""
     folder = DATA / "bench"
     if not any(folder.glob("*.json")):
         return "No result yet."
@@ -148,7 +148,7 @@ TABLES: dict[str, dict[str, Callable[[], str]]] = {
 
 
 def filled(text: str, name: str, table: str) -> str:
-    """Return a page with a table between its marks.
+    """Return a page with a table inserted between its marks.
 
     Raises:
         ValueError: The page lacks the marks.
@@ -167,7 +167,7 @@ def filled(text: str, name: str, table: str) -> str:
 
 
 def pages() -> dict[str, str]:
-    """Return each page with tables, as it has to be: path -> text."""
+    """Return path -> up-to-date text of each page with tables."""
     found = {"docs/modules.rst": modules_page()}
     for page, tables in TABLES.items():
         text = (ROOT / page).read_text()
@@ -178,7 +178,7 @@ def pages() -> dict[str, str]:
 
 
 def stale() -> list[str]:
-    """Return the pages whose tables are not those of today's code and data."""
+    """Return the pages whose tables are out of date."""
     return [page for page, text in pages().items() if (ROOT / page).read_text() != text]
 
 

@@ -1,4 +1,4 @@
-"""The world: scenes, renderers, the event camera, and the environment made of them."""
+"""The world: scenes, renderers, the event camera, and the environment built from them."""
 
 from pathlib import Path
 

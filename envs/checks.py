@@ -2,7 +2,7 @@
 
 import math
 
-LIMIT_M = 1e6  # how far from the origin a pose may be
+LIMIT_M = 1e6  # largest distance of a pose from the origin, per axis
 LIMIT_S = 1e9
 
 
@@ -20,7 +20,7 @@ def check_image(width: int, height: int, fov_deg: float, samples: int, cull_m: f
 def check_pose(pose: tuple[float, float, float, float], t_s: float = 0.0) -> None:
     """Raise ValueError unless `pose` (x, y, z [m], yaw [rad]) is finite, above ground and within 1000 km."""
     x, y, z, yaw = pose
-    # Each on its own: max() of Python may pass a NaN over.
+    # Each value separately: Python's max() may ignore a NaN.
     near = all(abs(value) <= LIMIT_M for value in (x, y, z))
     if not (near and z >= 0.0 and math.isfinite(yaw)):
         raise ValueError(f"pose (x, y, z, yaw) must be finite, z >= 0 and within {LIMIT_M:g} m, got {pose}")

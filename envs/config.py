@@ -1,8 +1,8 @@
 """Every setting of the world and its sensor: names, units, ranges, defaults.
 
-One `EnvConfig` describes one simulation completely. Construction is the border: a value
-of the wrong type, out of range, NaN or infinite raises `pydantic.ValidationError` (a
-ValueError) that names the key, the value and the rule; an unknown key does too.
+One `EnvConfig` describes one simulation completely. Values are checked at construction: an unknown key, or
+a value of the wrong type, out of range, NaN or infinite, raises `pydantic.ValidationError` (a ValueError)
+that names the key, the value and the rule.
 """
 
 import dataclasses
@@ -32,7 +32,7 @@ Fraction = Annotated[float, Field(ge=0, le=1)]
 
 
 def plain_numbers(cls: type, given: Any) -> Any:
-    """Replace NumPy's integers and truth values among the arguments of a class by Python's."""
+    """Convert NumPy integers and booleans among the arguments of a class to Python's own."""
 
     def plain(value: Any) -> Any:
         if isinstance(value, Mapping):
@@ -44,11 +44,11 @@ def plain_numbers(cls: type, given: Any) -> Any:
     return plain(given)
 
 
-PLAIN = cast(Any, classmethod(plain_numbers))  # of every class of settings, before its other checks
+PLAIN = cast(Any, classmethod(plain_numbers))  # runs first in every settings class, before its other checks
 
 
 def _layout_value(value: Any) -> Any:
-    """Return a layout value in plain form: one rule and one message instead of those of a union of types."""
+    """Return a layout value in plain form; a single rule gives a clearer message than a union of types."""
     if isinstance(value, bool | str):
         return value
     if isinstance(value, Mapping):
@@ -62,7 +62,7 @@ def _layout_value(value: Any) -> Any:
 
 Value = Annotated[Any, PlainValidator(_layout_value)]
 
-# Faults that plug-ins add: name -> what makes one at the start of an episode, see `envs.events.faults`.
+# Faults that plug-ins add: name -> function that creates one per episode, see `envs.events.faults`.
 ADDED_FAULTS: dict[str, Callable[..., Any]] = {}
 
 # Vehicles and tasks: name -> "module:attribute", see `envs.vehicles.dynamics` and `envs.vehicles.task`.
@@ -71,7 +71,7 @@ VEHICLES: dict[str, str] = {
     "point_mass": "envs.vehicles.point_mass:make_point_mass",
     "crazyflie": "envs.vehicles.point_mass:make_crazyflie",
 }
-TASKS: dict[str, str] = {"corridor": ""}  # judged within the compiled step
+TASKS: dict[str, str] = {"corridor": ""}  # "": the compiled step judges it itself
 
 
 def _of_a_fault(name: str) -> str:
@@ -82,7 +82,7 @@ def _of_a_fault(name: str) -> str:
 
 
 def _row_of(table: Mapping[str, object]) -> AfterValidator:
-    """Return a check that a name is a row of this table, plug-ins' rows included."""
+    """Return a check that a name is a row of this table; plug-ins may have added rows."""
 
     def check(name: str) -> str:
         if name not in table:
@@ -93,10 +93,10 @@ def _row_of(table: Mapping[str, object]) -> AfterValidator:
 
 
 AddedFault = Annotated[str, AfterValidator(_of_a_fault)]
-Setting = float | int | str | None  # of the sensor
+Setting = float | int | str | None  # value of a sensor setting
 Observation = Literal["window", "event_image", "luminance", "events", "none"]
 Split = Literal["train", "validation", "eval"]
-LUMINANCE_FLOOR = 1e-3  # of luminance that is rendered, or has no steps for other reasons
+LUMINANCE_FLOOR = 1e-3  # for luminance without quantization steps, such as rendered luminance
 WITHOUT_EVENTS = ("luminance", "none")  # observations for which no event camera is simulated
 
 
@@ -112,32 +112,33 @@ class CameraConfig:
         contrast_threshold_off: Log-intensity step of OFF events; None: as for ON.
         memory: "reference": each pixel remembers the level of its last event, as a real
             sensor does. "frame": the paper's difference of two frames (equations 5-8),
-            which forgets what stayed below the threshold. "legacy": the paper's published
+            which forgets changes below the threshold. "legacy": the paper's published
             code, see `envs.events.camera`.
-        luminance_floor: Added to luminance before the logarithm, so that black is defined;
-            with response "lin_log" the luminance below which a pixel responds linearly. None: right
-            for what the camera is shown, `LUMINANCE_FLOOR` but for frames of few grey levels
+        luminance_floor: Added to luminance before the logarithm, so that the response to black is
+            finite; with response "lin_log", the luminance below which a pixel responds linearly. None:
+            chosen for the input: `LUMINANCE_FLOOR`, or more for frames of few grey levels
             (`envs.recordings.light.usual_floor`).
-        max_events_per_pixel: Most events of one pixel between two renders, the earliest.
-        response: "log": log(luminance + floor). "lin_log": log(luminance) from the floor
-            upwards, and below it its tangent, as photoreceptors in the dark.
-        excess: What becomes of events beyond the most. "drop": the reference moves on past
-            them and their number is reported. "carry": they fire in later frames.
+        max_events_per_pixel: Largest number of events of one pixel between two renders; the
+            earliest ones fire.
+        response: "log": log(luminance + floor). "lin_log": log(luminance) above the floor and
+            its tangent below, as photoreceptors respond in the dark.
+        excess: Treatment of events beyond `max_events_per_pixel`. "drop": the reference moves on
+            past them and their number is reported. "carry": they fire in later frames.
         threshold_mismatch: Standard deviation of the pixels' thresholds as a share of the
-            threshold; fixed for each pixel, ON and OFF apart, at least a tenth of the
-            nominal. Real sensors: about 0.03.
-        threshold_seed: Which sensor of its kind: seed of the pixels' thresholds.
+            threshold. Each pixel's thresholds are fixed, independent for ON and OFF, and at least
+            a tenth of the nominal. Real sensors: about 0.03.
+        threshold_seed: Seed of the pixels' thresholds, which identifies one sensor of its kind.
         refractory_us: Refractory period of a pixel after an event [us]; at its end the pixel takes
             the level of that moment as its reference.
-        encoding: What the luminance, white = 1, goes through before the response.
-            "linear32": nothing. "linear8": clipped to [0, 1] and rounded to 8 bits.
-            "gamma8": the same on a scale of gamma 2.2, decoded again.
+        encoding: Conversion of the luminance, white = 1, before the response. "linear32": none.
+            "linear8": clipped to [0, 1] and rounded to 8 bits. "gamma8": rounded to 8 bits on
+            a scale of gamma 2.2, then decoded.
         cutoff_hz: Bandwidth of the photoreceptors, a first-order low-pass filter on the response
-            [Hz]; 0: they follow at once. Pixels see what is behind it.
-        cutoff_grows_with_light: Whether that is the bandwidth in white, which falls in proportion to
-            the light to 7 % of it in black (v2e).
-        latency_us: From the crossing of a level to the time of its event [us].
-        latency_jitter_us: Standard deviation of that time from event to event [us].
+            [Hz]; pixels see the filtered response. 0: no filter.
+        cutoff_grows_with_light: Whether `cutoff_hz` is the bandwidth in white, and the bandwidth falls
+            linearly with the light to 7 % of `cutoff_hz` in black (v2e).
+        latency_us: Time from the crossing of a level to the time of its event [us].
+        latency_jitter_us: Standard deviation of the latency from event to event [us].
         readout_hz: Most events per second that leave the sensor; 0: all. Rows take turns, the events
             of a row leave together, and a pixel that waits for its turn fires no other event.
     """
@@ -193,31 +194,31 @@ class FaultsConfig:
 
     Attributes:
         sparsity: Fraction of pixels that are dead for the whole episode.
-        background_activity: Events without cause, as a fraction of the true events
-            (appendix D.3); 0.1 adds one false event to ten true ones on average.
-        background_activity_hz: Events without cause per pixel and second, as a real
-            sensor makes them, also in a still scene. Both are laid on top of the other events.
-        event_dropout: Probability that a true event is lost, each on its own.
+        background_activity: False events as a fraction of the true events (appendix D.3); 0.1 adds
+            one false event to ten true ones on average.
+        background_activity_hz: False events per pixel and second, as a real sensor produces them
+            even in a still scene. Both kinds are added to the other events.
+        event_dropout: Probability that a true event is lost, independently for each event.
         displaced: Probability that a true event is reported by a neighbouring pixel.
         flipped: Probability that a true event is reported with the other polarity.
-        shot_noise_hz: Events without cause per pixel and second in black, as photons arrive
-            unevenly; a quarter of that at white, on a straight line between (v2e). They are
-            crossings of the pixel's own levels, so ON and OFF alternate (`envs.events.pixel_noise`).
-        leak_hz: ON events per pixel and second of a still pixel, because its level leaks.
-        leak_jitter: Standard deviation of the time between two of them, as a share of its mean.
+        shot_noise_hz: False events per pixel and second in black, because photons arrive
+            unevenly; a quarter of that at white, linear in between (v2e). They are crossings of
+            the pixel's own levels, so ON and OFF alternate (`envs.events.pixel_noise`).
+        leak_hz: ON events per second of a still pixel, because its level leaks.
+        leak_jitter: Standard deviation of the time between two leak events, as a share of its mean.
         noise_spread: Standard deviation over the pixels of the logarithm to base 10 of their rates
             of shot noise and leakage [decades].
         hot_pixel_share: Fraction of pixels that are hot for the whole episode.
         hot_pixel_hz: Events per second of a hot pixel.
-        dead_block: Fraction of the image that a rectangle of its proportions covers, at a random place,
-            whose pixels are dead for the whole episode.
-        flicker_depth: Amplitude by which the scene's light flickers, as a share of the light
-            (`envs.events.flicker`); pictures, which expose for longer, do not show it.
-        flicker_hz: Its frequency: 100 with mains of 50 Hz, 120 with 60 Hz.
-        burst_hz: Mean number of bursts of events without cause that begin in a second, a Poisson process.
+        dead_block: Fraction of the image covered by a rectangle of dead pixels. The rectangle has the
+            image's proportions and a random place, fixed for the whole episode.
+        flicker_depth: Amplitude of the flicker of the scene's light, as a share of the light
+            (`envs.events.flicker`); pictures, with their longer exposure, do not show it.
+        flicker_hz: Frequency of the flicker: 100 with mains of 50 Hz, 120 with 60 Hz.
+        burst_hz: Mean number of bursts of false events that start per second, a Poisson process.
         burst_ms: Length of a burst [ms].
-        burst_activity_hz: Events per second of each pixel in a burst.
-        added: How much of each fault that a plug-in adds, such as {"flicker": 0.2}; 0 is none of it.
+        burst_activity_hz: False events per pixel and second in a burst.
+        added: Amount of each fault that a plug-in adds, such as {"flicker": 0.2}; 0: none.
     """
 
     _plain = model_validator(mode="before")(PLAIN)
@@ -245,10 +246,10 @@ class FaultsConfig:
 
 @dataclass(frozen=True, config=STRICT)
 class FidelityConfig:
-    """Required accuracy of the events; `envs.fidelity.plan_renders` chooses the cheapest rendering for it.
+    """Required accuracy of the events, for which `envs.fidelity.plan_renders` chooses the cheapest rendering.
 
     Attributes:
-        tolerance: Accepted share of events that differ from the converged ones in pixel,
+        tolerance: Accepted share of events that differ from the converged simulation in pixel,
             polarity or by more than 5 % of a control step in time, see `envs.event_error`.
         max_step_m: Longest way between two renders [m]; None: chosen.
         samples: Anti-aliasing of the renderer; None: chosen.
@@ -263,7 +264,7 @@ class FidelityConfig:
     cull_m: Positive | None = None
 
 
-# Of the camera, that came later than the first published policies.
+# Camera settings that are newer than the first published policies.
 LATER_SETTINGS = (
     *("cutoff_hz", "cutoff_grows_with_light"),
     *("latency_us", "latency_jitter_us", "readout_hz"),
@@ -272,7 +273,7 @@ LATER_FAULTS = (
     *("dead_block", "flicker_depth", "flicker_hz"),
     *("burst_hz", "burst_ms", "burst_activity_hz"),
 )
-# Of the environment, with the values that do what was done before they existed.
+# Newer settings of the environment, with the values that reproduce the older behaviour.
 LATER_ENV_SETTINGS: dict[str, object] = {
     **{"vehicle": "kinematic", "body": {}, "task": "corridor"},
     "velocity_noise_mps": 0.0,
@@ -286,29 +287,29 @@ class EnvConfig:
 
     Attributes:
         scene: Name of a layout in `envs.scene.layouts`, or the path of a mesh file.
-        layout: Values that replace the layout's own, such as {"num_obstacles": 60, "shape": "box",
-            "ground_texture": {"pattern": "rings"}}; keys are the layout's fields.
+        layout: Values that replace fields of the layout, such as {"num_obstacles": 60, "shape": "box",
+            "ground_texture": {"pattern": "rings"}}.
         control_hz: Actions (and event windows) per second [Hz].
-        speed_mps: Speed [m/s]: constant of a kinematic vehicle, whose way of one step is
-            speed_mps / control_hz; at the start of any other.
-        vehicle: A row of `VEHICLES`: what turns an action into motion (`envs.vehicles.dynamics`).
-        body: Values that replace the vehicle's own, such as {"tau_s": 0.3}.
+        speed_mps: Speed [m/s]. A kinematic vehicle keeps it, so one step covers
+            speed_mps / control_hz; any other vehicle starts with it.
+        vehicle: A row of `VEHICLES`, which turns actions into motion (`envs.vehicles.dynamics`).
+        body: Values that replace settings of the vehicle, such as {"tau_s": 0.3}.
         task: A row of `TASKS`: reward and end of an episode (`envs.vehicles.task`).
-        action_delay_ms: An action is taken in the first control step that begins so long after its choice
-            [ms]; until then the vehicle follows earlier choices, at first straight ahead.
-        velocity_noise_mps: Standard deviation of either component of the velocity that the vehicle
+        action_delay_ms: Time from the choice of an action to the first control step that may take it [ms].
+            Until then the vehicle follows earlier choices; at the start it flies straight ahead.
+        velocity_noise_mps: Standard deviation of each component of the velocity that the vehicle
             measures (`CorridorEnv.measured_velocity_mps`) [m/s].
-        vehicle_radius_m: The vehicle is a disc of this radius [m].
+        vehicle_radius_m: Radius of the vehicle, a disc [m].
         camera_height_m: Height of the camera above the ground [m].
         time_limit_s: Flight time after which the episode is truncated [s].
-        observation: "window", "event_image", "events"; "luminance": one picture a step, and no
-            event camera; or "none": nothing is rendered, for an agent that looks at nothing.
-        window_capacity: Most events that one window holds; the oldest beyond it are
-            dropped and counted. None: a window is as long as its step has events.
-        filter_support: An event is observed only if at least so many of its 8 neighbours fired shortly
-            before (`core.neighbour_filter`); 0: every event is.
-        filter_tau_us: How long before, at most [us].
-        split: Which corridors: those of one split never occur in another, whatever the seed.
+        observation: "window", "event_image", "events"; "luminance": one picture a step, without an
+            event camera; or "none": nothing is rendered, for an agent that needs no observation.
+        window_capacity: Largest number of events in one window; the oldest events beyond it are
+            dropped and counted. None: a window holds all events of its step.
+        filter_support: Smallest number of a pixel's 8 neighbours that must have fired shortly before its
+            event, or the event is not observed (`core.neighbour_filter`); 0: no filter.
+        filter_tau_us: Longest time since a neighbour fired that counts as shortly before [us].
+        split: Set of corridors; corridors of one split never occur in another, whatever the seed.
         renderer: "raycast", "pyrender", "spheres" (hundreds of spheres, approximated:
             `envs.raycast.discs`), or "auto": "raycast" unless the scene has a mesh.
     """
@@ -346,7 +347,7 @@ class EnvConfig:
     @field_validator("camera", "faults", "fidelity", mode="before")
     @classmethod
     def _by_name(cls, value: Any, info: ValidationInfo) -> Any:
-        """Make a section from a mapping of its fields, the form in which a policy's manifest stores it."""
+        """Create a section from a mapping of its fields, which is how a policy's manifest stores it."""
         return SECTIONS[str(info.field_name)](**value) if isinstance(value, Mapping) else value
 
     @field_validator("camera")
@@ -358,8 +359,8 @@ class EnvConfig:
 def hashed_settings(config: EnvConfig) -> dict[str, Any]:
     """Return all settings as plain containers, to be hashed.
 
-    `LATER_ENV_SETTINGS` and `LATER_FAULTS` count only where they change something, so that older hashes stay
-    valid.
+    `LATER_ENV_SETTINGS` and `LATER_FAULTS` are included only if they change something, so that older hashes
+    stay valid.
     """
     settings = dataclasses.asdict(config)
     faults = settings["faults"]
@@ -370,9 +371,9 @@ def hashed_settings(config: EnvConfig) -> dict[str, Any]:
 def seen_settings(config: EnvConfig, observation: str) -> EnvConfig:
     """Return the settings that an observation depends on; all others are set to their defaults.
 
-    Two simulations with equal ones give the same episodes, step by step, to an agent that observes
-    "luminance" (whatever the event camera is) or "none" (whatever any camera is); to other agents
-    every setting may matter.
+    Two simulations for which this function returns equal settings give the same episodes, step by step, to
+    an agent that observes "luminance" (whatever the event camera) or "none" (whatever the camera). For other
+    observations every setting may matter.
     """
     if observation not in WITHOUT_EVENTS:
         return config
@@ -394,11 +395,10 @@ def seen_settings(config: EnvConfig, observation: str) -> EnvConfig:
 
 
 def sensor_settings(config: EnvConfig) -> dict[str, Setting]:
-    """Return the settings that give an event its meaning: data, encoder and policy must share them.
+    """Return the settings that give an event its meaning; data, encoder and policy must share them.
 
-    Those of the neighbour filter are among them where there is one, the vehicle where it is not the kinematic
-    one, and `LATER_SETTINGS` where they are not the defaults: what was made before they existed has its
-    hash still.
+    They include the neighbour filter only if it is on, the vehicle only if it is not kinematic, and each of
+    `LATER_SETTINGS` only if it is not the default, so that hashes from before those settings stay valid.
     """
     camera = dataclasses.asdict(config.camera)
     for name in LATER_SETTINGS:
@@ -413,7 +413,7 @@ def sensor_settings(config: EnvConfig) -> dict[str, Setting]:
 
 
 def sensor_differences(theirs: Mapping[str, object], config: EnvConfig) -> dict[str, tuple[object, object]]:
-    """Return setting -> (their value, this simulation's value) for the sensor settings that differ."""
+    """Return the sensor settings that differ: setting -> (their value, this simulation's value)."""
     ours = sensor_settings(config)
     pairs = {key: (theirs.get(key), ours.get(key)) for key in {**theirs, **ours}}
     return {key: pair for key, pair in pairs.items() if pair[0] != pair[1]}

@@ -1,13 +1,13 @@
 """The corridor as a Gymnasium environment, single and vectorised (appendix D.1).
 
-The vehicle moves at constant speed, one of three directions a step, while its camera keeps
-looking along +y; `EnvConfig.vehicle` names others (`envs.vehicles.dynamics`). What ends a step
-early is decided along the way of the step: the vehicle stops where it first touches an obstacle
-or a wall, or at the goal line, whichever comes first; both at the same place is a collision,
-and so is a start in contact.
+The vehicle moves at constant speed, in one of three directions per step, while its camera always
+points along +y. `EnvConfig.vehicle` selects other vehicles (`envs.vehicles.dynamics`). Contact is
+tested along the way of the step: the vehicle stops at its first contact with an obstacle or a wall, or
+at the goal line, whichever comes first. Both at the same place is a collision, and so is a start
+in contact.
 
-Time and way are counted in whole steps, so neither drifts. Each episode draws from streams
-of its own, made of (split, seed, episode): a corridor of one split never occurs in another.
+Time and way are counted in whole steps, so neither drifts. Each episode draws from its own random
+streams, seeded by (split, seed, episode): a corridor of one split never occurs in another.
 """
 
 import dataclasses
@@ -30,23 +30,24 @@ from envs.sensor import Sensor
 from envs.vehicles import StepError, Vehicles
 from envs.vehicles.dynamics import make_dynamics, number_type, planned_config, wrong_actions
 
-VELOCITY_STREAM = 0x57A7E  # of the noise of measured velocity, in the entropy of its seed
-Draw = Callable[[EnvConfig, np.random.Generator], EnvConfig]  # the settings of an episode, drawn
+VELOCITY_STREAM = 0x57A7E  # part of the seed of the noise on measured velocity
+Draw = Callable[[EnvConfig, np.random.Generator], EnvConfig]  # draws the settings of an episode
 
 
 class Info(TypedDict):
     """The `info` that `CorridorEnv` returns with each observation.
 
-    Gymnasium and stable-baselines3 add keys of their own, such as "episode", which none here may have.
+    Gymnasium and stable-baselines3 add their own keys, such as "episode"; no key here may have such a name.
 
     Attributes:
         episode_seed: Seed of the series of episodes.
         episode_number: Number of the episode in its series, from 0.
         x_m, y_m: Position of the vehicle [m].
         distance_m: Progress along y since the start [m].
-        success, collision: What ended the episode; at most one of them.
-        num_events: Events of the last step, faults included.
-        dropped_events: Events of the last step lost to the camera's cap or the window's capacity.
+        success, collision: Whether the goal line or a contact ended the episode; at most one is True.
+        num_events: Number of events of the last step, faults included.
+        dropped_events: Number of events of the last step lost to the camera's cap, its readout or the
+            window's capacity.
         t_us: Simulated time [us].
     """
 
@@ -63,7 +64,7 @@ class Info(TypedDict):
 
 
 class CorridorEnv(gymnasium.Env):
-    """One episode from y = 0 to the goal line; `observation` is as `envs.observations` says.
+    """One episode from y = 0 to the goal line, with an observation of `envs.observations`.
 
     Actions: 0 forward, 1 left 45 degrees, 2 right 45 degrees. Reward (appendix D.1.1):
     metres of progress along y, +100 at the goal line, -100 at a collision; both terminate.
@@ -85,18 +86,18 @@ class CorridorEnv(gymnasium.Env):
         draw: Draw | None = None,
         **fields: Any,
     ) -> None:
-        """Make the environment.
+        """Create the environment.
 
         Args:
-            config: The settings, or a mapping of fields, as RLlib's `env_config`; None: `EnvConfig()`.
+            config: The settings, or a mapping of fields such as RLlib's `env_config`; None: `EnvConfig()`.
             render_mode: "rgb_array" for pictures, or None.
             draw: Draws the settings of each episode from `config` and a generator of the episode; the
                 observation space must stay the same.
-            fields: To replace in `config`.
+            fields: Fields to replace in `config`.
 
         Raises:
             TypeError: A field is unknown; clients that probe for an argument expect this exception.
-            ValueError: A setting or the render mode is refused.
+            ValueError: A setting or the render mode is invalid.
         """
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f'render_mode must be None or "rgb_array"; got {render_mode!r}.')
@@ -117,7 +118,7 @@ class CorridorEnv(gymnasium.Env):
         self._actions: list[Any] = []  # of this episode
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what copies and pickles need: the settings, the episode and its actions."""
+        """Return the state for copies and pickles: the settings, the episode and its actions."""
         arguments = {"config": self._nominal, "render_mode": self.render_mode, "draw": self._draw}
         set_later = {"action_space", "observation_space", "spec", "_np_random", "_np_random_seed"}
         return {
@@ -129,7 +130,7 @@ class CorridorEnv(gymnasium.Env):
         }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Make the environment again, and repeat the episode's actions: the same bytes follow."""
+        """Create the environment again and repeat the episode's actions, which gives the same bytes."""
         self.__init__(**state["arguments"])  # type: ignore[misc]
         self.restore(state)
 
@@ -151,15 +152,15 @@ class CorridorEnv(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: Mapping[str, object] | None = None
     ) -> tuple[np.ndarray, Info]:
-        """Start an episode; its first render makes no events.
+        """Start an episode; its first render gives no events.
 
         Args:
-            seed: Starts a series of episodes, of which this is number 0. Without it, the
-                next episode of the series starts.
+            seed: Seed of a new series of episodes, of which this is number 0. None: start the
+                next episode of the current series.
             options: {"episode_number": number} starts that episode of the series.
 
         Raises:
-            ValueError: An unknown option, or an episode that is no integer >= 0.
+            ValueError: An option is unknown, or the episode number is not an integer >= 0.
         """
         self.begin(seed, options)
         return self.observe(), self.info()
@@ -196,9 +197,9 @@ class CorridorEnv(gymnasium.Env):
         """Simulate one control step.
 
         Raises:
-            ResetNeeded: The episode is over, or has not begun.
+            ResetNeeded: The episode is over or has not begun.
             ValueError: The action is not in the action space; or a number became NaN or
-                infinite, with the episode, step and seed named.
+                infinite, and the message names the episode, step and seed.
         """
         row = self._row
         if self._vehicles.rows["over"][row]:
@@ -219,11 +220,11 @@ class CorridorEnv(gymnasium.Env):
         return self.observe(), float(vehicle["reward"]), terminated, bool(vehicle["truncated"]), info
 
     def remember(self, action: np.ndarray) -> None:
-        """Remember an action of this episode for copies of the environment."""
+        """Store an action of this episode, for copies of the environment."""
         self._actions.append(action)
 
     def render(self) -> Any:
-        """Draw luminance beside the events of the last step: uint8 (4 H, 8 W, 3); None without a mode."""
+        """Draw luminance next to the events of the last step: uint8 (4 H, 8 W, 3); None without a mode."""
         return None if self.render_mode is None else picture(self.events, self.luminance)
 
     def close(self) -> None:
@@ -234,7 +235,7 @@ class CorridorEnv(gymnasium.Env):
     def events(self) -> np.ndarray:
         """EVENT array of the last step, faults included; empty with observation "luminance" or "none".
 
-        One of a vector environment has those of the vector's last step.
+        In a vector environment it holds this environment's events in the vector's last step.
         """
         return self._vehicles.events_of(self._row)
 
@@ -245,7 +246,7 @@ class CorridorEnv(gymnasium.Env):
 
     @property
     def true_events(self) -> np.ndarray:
-        """Return the events before the faults of the sensor."""
+        """Return the events of the last step before the faults of the sensor."""
         return self._vehicles.true_of(self._row)
 
     @property
@@ -260,7 +261,7 @@ class CorridorEnv(gymnasium.Env):
 
     @property
     def velocity_mps(self) -> tuple[float, float]:
-        """Velocity to the right and ahead [m/s]; a kinematic vehicle's is the mean of its last step."""
+        """Velocity to the right and ahead [m/s]; for a kinematic vehicle, the mean over its last step."""
         vehicle = self._vehicles.rows[self._row]
         if vehicle["parts"] or not vehicle["t_us"]:
             return float(vehicle["vx_mps"]), float(vehicle["vy_mps"])
@@ -282,9 +283,10 @@ class CorridorEnv(gymnasium.Env):
         return velocity
 
     def place_of_action(self) -> tuple[float, float]:
-        """Return where the next decision takes effect if nothing is in the way: x, y [m].
+        """Return the place where the next decision takes effect if nothing is in the way: x, y [m].
 
-        That is where the vehicle is, but for `action_delay_ms`: what was decided before moves it until then.
+        Without `action_delay_ms` it is the vehicle's place. With a delay, earlier decisions move the vehicle
+        until then.
         """
         vehicle = self._vehicles.rows[self._row]
         if not vehicle["delay"]:
@@ -300,7 +302,7 @@ class CorridorEnv(gymnasium.Env):
 
     @property
     def moving(self) -> tuple[MovingBody, ...]:
-        """Return the moving bodies on their current paths; a throw gives a ball a new path."""
+        """Return the moving bodies on their current paths; each throw gives the ball a new path."""
         return self._vehicles.moving(self._row)
 
     def state_of_action(self) -> np.ndarray:
@@ -327,11 +329,11 @@ class CorridorEnv(gymnasium.Env):
 
 
 class CorridorVectorEnv(VectorEnv):
-    """Several episodes at once; each has the bytes of a `CorridorEnv` with the same seed.
+    """Several episodes at once, each with the same bytes as a `CorridorEnv` with the same seed.
 
-    `autoreset_mode` says what happens to an episode that is over, as in Gymnasium's SyncVectorEnv.
-    By default the next step resets it (NEXT_STEP); its action is ignored and its reward is 0.
-    All returned arrays are fresh.
+    `autoreset_mode` decides what happens to an episode that is over, as in Gymnasium's SyncVectorEnv. By
+    default (NEXT_STEP) the next step resets the episode; its action is ignored and its reward is 0. All
+    returned arrays are fresh.
     """
 
     metadata = {**CorridorEnv.metadata, "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
@@ -346,22 +348,23 @@ class CorridorVectorEnv(VectorEnv):
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         **fields: Any,
     ) -> None:
-        """Make `num_envs` environments; the arguments not named here are those of `CorridorEnv`.
+        """Create `num_envs` environments.
 
         Args:
-            num_envs: Environments.
-            config: One for all, or several, which the environments take in turn.
+            num_envs: Number of environments.
+            config: One config for all environments, or several, which the environments take in turn.
             render_mode: See `CorridorEnv`.
             draw: See `CorridorEnv`.
-            max_episode_steps: Steps after which an episode is truncated; None: see `time_limit_s`.
-            autoreset_mode: NEXT_STEP; SAME_STEP, with infos "final_obs" and "final_info";
-                or DISABLED, where the caller resets by `options={"reset_mask": bool (num_envs,)}`.
-            fields: To replace in every config.
+            max_episode_steps: Steps after which an episode is truncated; None: only `time_limit_s` applies.
+            autoreset_mode: NEXT_STEP; SAME_STEP, with infos "final_obs" and "final_info"; or DISABLED, in
+                which case the caller resets by `options={"reset_mask": bool (num_envs,)}`.
+            fields: Fields to replace in every config.
 
         Raises:
-            ValueError: A setting is refused, `num_envs` is below 1, or configs have different observations.
+            ValueError: A setting is invalid, `num_envs` or `max_episode_steps` is below 1, or configs differ
+                in observation or action space.
         """
-        self.envs: list[CorridorEnv] = []  # first, because Gymnasium closes what failed to start
+        self.envs: list[CorridorEnv] = []  # set first: Gymnasium closes an object that failed to start
         if num_envs < 1:
             raise ValueError(f"num_envs must be >= 1; got {num_envs}.")
         self.num_envs, self.render_mode = num_envs, render_mode
@@ -398,11 +401,11 @@ class CorridorVectorEnv(VectorEnv):
         """Reset all environments.
 
         Args:
-            seed: One per environment, or one number, see `envs.kinematics.spread_seeds`.
-            options: As for `CorridorEnv.reset`, for all; "reset_mask", bool (num_envs,), resets some alone.
+            seed: One seed per environment, or one number, see `envs.kinematics.spread_seeds`.
+            options: As for `CorridorEnv.reset`, for all; "reset_mask", bool (num_envs,), resets only some.
 
         Raises:
-            ValueError: The number of seeds is not that of environments, or the mask is none.
+            ValueError: The number of seeds differs from `num_envs`, or the mask has a wrong shape or dtype.
         """
         seeds = kinematics.spread_seeds(seed, self.num_envs)
         if options is not None and "reset_mask" in options:
@@ -420,9 +423,9 @@ class CorridorVectorEnv(VectorEnv):
         """Step all environments, or reset those that were over.
 
         Raises:
-            ResetNeeded: No reset yet, or an environment failed in the step before.
-            ValueError: The number of actions is not that of environments, or one is refused; or as
-                `CorridorEnv.step`.
+            ResetNeeded: No reset yet, or an environment failed in the previous step.
+            ValueError: The number of actions differs from `num_envs`, or an action is invalid; or as
+                for `CorridorEnv.step`.
         """
         over = self._over
         self._step_active(np.asarray(actions), ~over)
@@ -436,7 +439,7 @@ class CorridorVectorEnv(VectorEnv):
         return observations, rewards, terminated, truncated, infos
 
     def _reset_now(self, ended: np.ndarray, last: Any, infos: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-        """Reset the episodes that have ended; return observations, and infos with what they ended with."""
+        """Reset the episodes that have ended; return observations, and infos with the final observations."""
         final, observations = np.full(self.num_envs, None, object), list(last)
         final_info = {name: values.copy() for name, values in infos.items() if not name.startswith("_")}
         for row in np.flatnonzero(ended):
@@ -460,11 +463,11 @@ class CorridorVectorEnv(VectorEnv):
 
     @property
     def np_random_seed(self) -> tuple[int | None, ...]:
-        """Seeds of all environments' generators."""
+        """Seeds of the generators of all environments."""
         return tuple(env.np_random_seed for env in self.envs)
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """Call a method of every environment, or read an attribute, as Gymnasium's SyncVectorEnv."""
+        """Call a method or read an attribute of every environment, like Gymnasium's SyncVectorEnv."""
         found = [env.get_wrapper_attr(name) for env in self.envs]
         return tuple(value(*args, **kwargs) if callable(value) else value for value in found)
 
@@ -473,13 +476,13 @@ class CorridorVectorEnv(VectorEnv):
         return self.call(name)
 
     def set_attr(self, name: str, values: Any) -> None:
-        """Set an attribute of every environment to one value, or to its own of a list or tuple."""
+        """Set an attribute of every environment to one value, or to one element each of a list or tuple."""
         own = values if isinstance(values, list | tuple) else [values] * self.num_envs
         for env, value in zip(self.envs, own, strict=True):
             env.set_wrapper_attr(name, value)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what copies and pickles need, see `CorridorEnv`."""
+        """Return the state for copies and pickles, see `CorridorEnv`."""
         states = [env.__getstate__() for env in self.envs]
         arguments = {"render_mode": self.render_mode, "draw": states[0]["arguments"]["draw"]}
         arguments |= {"autoreset_mode": self.autoreset_mode, "max_episode_steps": self._max_steps}
@@ -493,7 +496,7 @@ class CorridorVectorEnv(VectorEnv):
         }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Make the environments again, and repeat their episodes."""
+        """Create the environments again and repeat their episodes."""
         self.__init__(**state["arguments"])  # type: ignore[misc]
         for env, own in zip(self.envs, state["states"], strict=True):
             env.restore(own)
@@ -504,15 +507,15 @@ class CorridorVectorEnv(VectorEnv):
     def step_some(
         self, actions: np.ndarray, some: np.ndarray
     ) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-        """Step some environments and leave the others as they are; unlike `step`, reset nothing.
+        """Step some environments and leave the others unchanged; unlike `step`, reset nothing.
 
         Args:
-            actions: (n,) integers, or (n, C) of a Box.
-            some: Numbers of the environments, int (n,), ascending. What is returned is theirs alone.
+            actions: (n,) integers, or (n, C) for a Box.
+            some: Numbers of the environments, int (n,), ascending. All returned arrays have n rows.
 
         Raises:
-            ResetNeeded: The episode of one of them is over, or has not begun.
-            ValueError: The number of actions is not that of these environments; or as `step`.
+            ResetNeeded: The episode of one of these environments is over or has not begun.
+            ValueError: The number of actions is not n; or as for `step`.
         """
         own, active = np.asarray(actions), np.zeros(self.num_envs, bool)
         if own.shape[:1] != some.shape:
@@ -551,7 +554,7 @@ class CorridorVectorEnv(VectorEnv):
             self.envs[row].remember(taken[row])
 
     def infos(self) -> dict[str, np.ndarray]:
-        """Return the infos of all environments as Gymnasium's dictionary of arrays, each with its mask."""
+        """Return the infos of all environments in Gymnasium's form, a dictionary of arrays and masks."""
         return self._infos(np.arange(self.num_envs))
 
     def _infos(self, some: np.ndarray) -> dict[str, np.ndarray]:
@@ -561,16 +564,16 @@ class CorridorVectorEnv(VectorEnv):
     def replay(
         self, episodes: Sequence[tuple[int, int, Sequence[Any]]]
     ) -> tuple[Any, np.ndarray, dict[str, np.ndarray]]:
-        """Repeat recorded actions in each environment; later steps then have the same bytes too.
+        """Repeat recorded actions in each environment, so that later steps have the same bytes too.
 
         Args:
-            episodes: Of each environment the seed, the number of its episode and the actions since its start.
+            episodes: For each environment: seed, number of the episode, and the actions since its start.
 
         Returns:
             The last observations, whether each episode is over, and infos.
 
         Raises:
-            ValueError: An episode ends before its last action: another simulation was given these.
+            ValueError: An episode ends before its last action, so the actions are from another simulation.
         """
         observations, self._over = [], np.zeros(self.num_envs, bool)
         for row, (env, (seed, number, actions)) in enumerate(zip(self.envs, episodes, strict=True)):
@@ -594,7 +597,7 @@ class CorridorVectorEnv(VectorEnv):
             env.close()
 
     def _observations(self, some: np.ndarray) -> Any:
-        """Return the observations of some environments in the last step; the others had no events in it."""
+        """Return the observations of some environments; the others must have no events in the last step."""
         config, vehicles = self.envs[0].config, self._vehicles
         if config.observation != "window":
             envs = [self.envs[row] for row in some]
@@ -604,14 +607,14 @@ class CorridorVectorEnv(VectorEnv):
         return pack_windows(vehicles.seen, ends, *clocks, config.window_capacity)
 
     def _batch(self, observations: Any) -> Any:
-        """Return observations as one fresh array; observations of different lengths stay a tuple."""
+        """Stack observations into one fresh array; return those of varying length as a tuple."""
         if isinstance(self.single_observation_space, spaces.Sequence):
             return tuple(observations)
         return np.stack(observations)
 
 
 def _infos_of(envs: Sequence[CorridorEnv], vehicles: Vehicles, some: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the `Info` of several environments as arrays; `some` are the rows of their vehicles."""
+    """Return the `Info` of several environments as arrays; `some` has the rows of their vehicles."""
     config, rows = envs[0].config, vehicles.rows[some]
     lost = rows["dropped"].copy()
     if config.observation == "window" and config.window_capacity is not None:
@@ -631,7 +634,7 @@ def _infos_of(envs: Sequence[CorridorEnv], vehicles: Vehicles, some: np.ndarray)
 
 
 def _is_action(space: spaces.Space, action: Any) -> bool:
-    """Whether an action is in a Discrete, which is asked without arrays, or in a Box."""
+    """Whether an action is in a Discrete (tested without arrays, which is faster) or in a Box."""
     if isinstance(space, spaces.Discrete):
         return not isinstance(action, bool | np.bool_) and bool(space.contains(action))
     own = np.asarray(action)
@@ -644,7 +647,7 @@ def _bad_action(space: spaces.Space, action: object) -> str:
     return f"action must be in {space}; got {action!r}."
 
 
-# Gymnasium imports what stands before the colon: make("envs.corridor:evade/Corridor-v0").
+# Gymnasium imports the module before the colon: make("envs.corridor:evade/Corridor-v0").
 if "evade/Corridor-v0" not in gymnasium.registry:
     gymnasium.register(
         id="evade/Corridor-v0",

@@ -15,24 +15,24 @@ from envs.sensor import Sensor
 from envs.vehicles import Vehicles
 from envs.vehicles.dynamics import make_dynamics
 
-# The converged simulation: at least so many times the renders of the tolerance 0.05, and in a control step;
-# outlines may move as far as at this tolerance; and this anti-aliasing.
+# The converged simulation: this multiple of the renders needed at tolerance 0.05, at least this many renders
+# a control step, the outline motion allowed at this tolerance, and this anti-aliasing.
 REFERENCE_RENDERS, REFERENCE_PARTS, REFERENCE_TOLERANCE = 6, 12, 0.003
 REFERENCE_SAMPLES = {"raycast": 24, "pyrender": 8}
 NO_CULLING_M = 1e6  # farther than any scene reaches
-TIME_SHARE = 0.05  # of a control step: how far apart in time two equal events may be
-MAX_KEPT = 64  # converged flights: several settings are measured against the same
+TIME_SHARE = 0.05  # of a control step: largest time difference between an event and its partner
+MAX_KEPT = 64  # converged flights in the cache: several settings are measured against the same flight
 _CONVERGED: dict[str, np.ndarray] = {}
-ENTROPY = 20_210_608  # the corridors measured in are those of no split
+ENTROPY = 20_210_608  # so that the measured corridors belong to no split
 
 
 class Flight(NamedTuple):
     """A straight flight of the kinematic vehicle that passes through everything.
 
     Attributes:
-        start: Where it begins, x and y [m].
-        action: The action that is taken in every step.
-        steps: Control steps.
+        start: Where the flight begins, x and y [m].
+        action: The action taken in every step.
+        steps: Number of control steps.
     """
 
     start: Point
@@ -45,7 +45,7 @@ class Accuracy(NamedTuple):
 
     Attributes:
         error: Event error against the converged simulation.
-        events: Events per control step, of the simulation and of the converged one.
+        events: Events per control step, of the simulation and of the converged simulation.
         renders: Renders per control step.
     """
 
@@ -55,20 +55,20 @@ class Accuracy(NamedTuple):
 
 
 def measure_event_error(config: EnvConfig, flights: int = 6, steps: int = 12, seed: int = 0) -> Accuracy:
-    """Measure the event error of a simulation on short flights, against the converged simulation of them.
+    """Measure the event error of a simulation against the converged simulation of the same short flights.
 
-    Converged are: the renderer (the ray caster wherever it can draw the scene), its
-    anti-aliasing, the number of renders, no culling, a camera that remembers and gets linear
-    luminance. Thresholds and other properties of the camera are those of `config`, its
-    faults are left out. Each flight has a corridor of its own and goes straight or at 45
-    degrees, where nothing is in its way, by the compiled step that episodes take. It flies the kinematic
-    vehicle at `config.speed_mps`, whatever `config.vehicle` is.
+    The converged simulation renders by the ray caster (pyrender if the scene has a mesh), with converged
+    anti-aliasing and number of renders and without culling. Its camera has memory "reference" and gets
+    linear luminance. Thresholds and other properties of the camera are the same as in `config`. Both
+    simulations leave out the faults. Each flight has its own corridor and goes straight or at 45 degrees
+    where nothing is in its way, by the compiled step that episodes take. It uses the kinematic vehicle at
+    `config.speed_mps`, whatever `config.vehicle` is.
 
     Args:
         config: The simulation.
-        flights: How many.
-        steps: Control steps of each.
-        seed: Of corridors and ways.
+        flights: Number of flights.
+        steps: Control steps of each flight.
+        seed: Seed of the corridors and flights.
 
     Raises:
         ValueError: The simulation has observation "luminance" or "none", which simulates no event camera.
@@ -93,14 +93,14 @@ def measure_event_error(config: EnvConfig, flights: int = 6, steps: int = 12, se
 def error_between(config: EnvConfig, other: EnvConfig, flights: int = 6, steps: int = 12) -> float:
     """Measure the event error between two sensors on the same short flights, such as with and without faults.
 
-    The flights are those of `measure_event_error`, the partners those of `event_error`, at most a twentieth
-    of a control step apart.
+    The flights are the same as in `measure_event_error`. Events pair up as in `event_error`, at most a
+    twentieth of a control step apart.
 
     Args:
         config: One simulation, with its faults.
-        other: Another one, of the same scene, rate and speed.
-        flights: How many.
-        steps: Control steps of each.
+        other: Another simulation with the same scene, rate and speed.
+        flights: Number of flights.
+        steps: Control steps of each flight.
 
     Raises:
         ValueError: Scene, rate or speed differ.
@@ -137,7 +137,7 @@ def converged(config: EnvConfig, scene: Scene) -> EnvConfig:
 def _measure_flight(
     config: EnvConfig, steps: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return the events of one flight with `config`, those of the converged simulation, and its renders."""
+    """Return a flight's events, its converged events and its number of renders, without faults."""
     scene, flight = _flight(config, steps, rng)
     config = dataclasses.replace(config, faults=FaultsConfig())
     events, renders = _events_of(config, scene, flight)
@@ -151,7 +151,7 @@ def _measure_flight(
 
 
 def _flight(config: EnvConfig, steps: int, rng: np.random.Generator) -> tuple[Scene, Flight]:
-    """Draw a corridor, and a straight flight in it that touches nothing, if there is one."""
+    """Draw a corridor and a straight flight in it that touches nothing, if 100 draws find such a flight."""
     scene = make_scene(config.scene, rng, config.vehicle_radius_m, config.camera_height_m, **config.layout)
     way_m = steps * config.speed_mps / config.control_hz
     for _ in range(100):
@@ -165,7 +165,7 @@ def _flight(config: EnvConfig, steps: int, rng: np.random.Generator) -> tuple[Sc
 
 
 def _events_of(config: EnvConfig, scene: Scene, flight: Flight) -> tuple[np.ndarray, float]:
-    """Return all events of a flight, and the number of renders."""
+    """Return all events of a flight and its number of renders."""
     config = dataclasses.replace(config, vehicle="kinematic", body={}, action_delay_ms=0.0, task="corridor")
     sensor, vehicles = Sensor(config), Vehicles(1)
     sensor.reset(scene, flight.start, np.random.default_rng(0))
@@ -183,9 +183,9 @@ def _events_of(config: EnvConfig, scene: Scene, flight: Flight) -> tuple[np.ndar
 def event_error(events: np.ndarray, reference: np.ndarray, tolerance_us: float) -> float:
     """Return the share of events without a partner: same pixel and polarity, at most `tolerance_us` apart.
 
-    Partners are one to one, as many as possible. The share is taken of both streams together,
-    1 - 2 pairs / (events + reference): 0 if all pair up (or both are empty), 1 if none does,
-    the same whichever stream is called the reference.
+    Events pair up one to one, in as many pairs as possible. The share counts both streams together,
+    1 - 2 pairs / (events + reference): 0 if all events pair up (or both streams are empty), 1 if none
+    does. It is symmetric in the two streams.
 
     Args:
         events: EVENT array, in any order.
@@ -204,7 +204,7 @@ def event_error(events: np.ndarray, reference: np.ndarray, tolerance_us: float) 
 
 
 def _by_pixel(events: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return keys of pixel and polarity, and times, sorted by key and then by time."""
+    """Return the keys (pixel and polarity) and times of events, sorted by key and then by time."""
     keys = (events["y"].astype(np.int64) << 17) | (events["x"].astype(np.int64) << 1) | (events["p"] > 0)
     order = np.lexsort((events["t"], keys))
     return keys[order], events["t"][order]
@@ -212,7 +212,7 @@ def _by_pixel(events: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @numba.njit(cache=True, error_model="numpy")
 def _pairs(keys, times, other_keys, other_times, tolerance):
-    """Count pairs in one pass over both streams; on a line, taking the earliest partner is optimal."""
+    """Count pairs in one pass over both streams; on a time line, taking the earliest partner is optimal."""
     i, j, pairs = 0, 0, 0
     while i < keys.size and j < other_keys.size:
         if keys[i] != other_keys[j]:

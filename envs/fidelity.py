@@ -1,7 +1,7 @@
 """Choose renderer, renders per control step and anti-aliasing of a scene from one tolerance.
 
 The tolerance is the accepted event error of `envs.event_error`. The rules below are fitted to
-that error as measured over all layouts, 45 to 400 Hz and thresholds 0.05 to 0.5
+measurements of this error over all layouts, 45 to 400 Hz and thresholds 0.05 to 0.5
 (`python -m benchmarks.fidelity`), with the constants rounded to the safe side.
 """
 
@@ -23,21 +23,21 @@ from envs.scene import CONE, ELLIPSOID, OBSTACLE, Scene
 
 RENDERERS = ("auto", "raycast", "pyrender", "spheres")
 
-CULL_M = 143.0  # at tolerance 0.05: what is farther adds a twentieth of the error
-RENDERS_TEXTURED = 1.3  # times those of a plain scene; at bodies only if their pattern has edges
-# How far an edge may move between two looks, at tolerance 0.05 in a control step of 0.1 m [pixels].
+CULL_M = 143.0  # at tolerance 0.05: obstacles farther away add a twentieth of the tolerance
+RENDERS_TEXTURED = 1.3  # factor against a plain scene; for bodies only if their pattern has edges
+# Largest motion of an edge between two looks, at tolerance 0.05 in a control step of 0.1 m [pixels].
 UPRIGHT_PX = 0.48
 LEVEL_PX = 0.25
 BENT_PX = 0.126
-LONGEST_BENT = 2.4  # times that of a bent one, in long control steps
-SHORT = 2.0  # time constants of a photoreceptor; in shorter control steps it needs no render of its own
+LONGEST_BENT = 2.4  # largest factor on BENT_PX, for long control steps
+SHORT = 2.0  # [time constants of a photoreceptor] longer control steps need a second render
 FOCAL_PIXELS = 32.0  # 64 pixels over 90 degrees
-# Samples at tolerance 0.05 in a control step of 0.1 m. Straight edges are exact whatever the samples; the
-# light and the arcs of cones and ellipsoids and the patterns of textures converge with them.
+# Samples at tolerance 0.05 in a control step of 0.1 m. Straight edges are exact with any number of samples.
+# The light and the arcs of cones and ellipsoids, and the patterns of textures, converge with more samples.
 SAMPLES = {"straight": 0.5, "textured": 1.5, "curved": 1.95, "curved noise": 2.9, "curved pattern": 10.0}
 MAX_SAMPLES = 16
-LOW_WALL_M = 0.1  # walls up to it stand for none
-PYRENDER_SAMPLES = ((0.3, 1), (0.15, 2), (0.0, 4))  # from which tolerance on how many do
+LOW_WALL_M = 0.1  # walls up to this height count as no walls
+PYRENDER_SAMPLES = ((0.3, 1), (0.15, 2), (0.0, 4))  # (smallest tolerance, samples)
 
 
 @dataclass(frozen=True)
@@ -46,12 +46,12 @@ class RenderPlan:
 
     Attributes:
         renderer: "raycast", "pyrender" or "spheres".
-        samples: Its anti-aliasing.
-        max_shifts_px: How far outlines may move between two looks at their columns.
-        max_step_m: Longest way between two renders [m]; infinite: one render a control step.
-        by_looks: Whether columns are looked at between the renders too, where something changes
-            in them (`envs.sensor.looks`).
-        cull_m: Obstacles farther than this are not drawn [m]; infinite: all are.
+        samples: Anti-aliasing of the renderer.
+        max_shifts_px: Largest motion of outlines between two looks at their columns [pixels].
+        max_step_m: Longest way between two renders [m]; infinite: one render per control step.
+        by_looks: Whether single columns are also rendered between the renders of whole images, when
+            something changes in them (`envs.sensor.looks`).
+        cull_m: Obstacles farther than this are not drawn [m]; infinite: all are drawn.
     """
 
     renderer: str
@@ -65,11 +65,11 @@ class RenderPlan:
 def plan_renders(config: EnvConfig, scene: Scene) -> RenderPlan:
     """Return the cheapest plan within `config.fidelity.tolerance`; settings given in `config.fidelity` stay.
 
-    The paper's two-frame cameras (memory "frame" and "legacy") see one frame a control step:
-    more of them would change what they report, not make it more exact.
+    The paper's two-frame cameras (memory "frame" and "legacy") get one frame per control step: more frames
+    would change their events, not make them more accurate.
 
     Raises:
-        ValueError: The ray caster is asked for a scene that only a mesh can represent.
+        ValueError: The chosen renderer cannot draw the scene.
     """
     asked = config.fidelity
     renderer = choose_renderer(config.renderer, scene)
@@ -90,8 +90,8 @@ def choose_renderer(name: str, scene: Scene) -> str:
     """Return the renderer called `name`; "auto" is the cheapest that can draw `scene`.
 
     Raises:
-        ValueError: The name is not known, or the renderer cannot draw the scene: the ray caster no mesh,
-            pyrender no bodies that move, and "spheres" nothing but plain spheres above plain ground.
+        ValueError: The name is unknown, or the renderer cannot draw the scene. The ray caster cannot draw
+            meshes, pyrender no moving bodies, "spheres" only plain spheres above plain ground.
     """
     if name not in RENDERERS:
         raise ValueError(f"renderer must be one of {RENDERERS}; got {name!r}.")
@@ -108,11 +108,11 @@ def choose_renderer(name: str, scene: Scene) -> str:
 
 
 def make_renderer(chosen: RenderPlan, scene: Scene, width: int, height: int, fov_deg: float) -> Any:
-    """Make the renderer of a plan; RuntimeError if it is pyrender, and pyrender or OpenGL is missing."""
+    """Create the renderer of a plan; RuntimeError if it needs pyrender or OpenGL and they are missing."""
     make: Any = RaycastRenderer
     if chosen.renderer == "spheres":
         make = partial(RaycastRenderer, discs=True)
-    if chosen.renderer == "pyrender":  # imported only where it is needed: it loads OpenGL
+    if chosen.renderer == "pyrender":  # imported only here, because it loads OpenGL
         if importlib.util.find_spec("pyrender") is None:
             raise RuntimeError("renderer='pyrender', which meshes need, is not installed: evade[meshes]")
         make = importlib.import_module("envs.rasterize.renderer").PyrenderRenderer
@@ -120,13 +120,13 @@ def make_renderer(chosen: RenderPlan, scene: Scene, width: int, height: int, fov
 
 
 def sub_renders(step_m: float, max_step_m: float) -> int:
-    """Return how many equal parts, one render each, keep a way of `step_m` within `max_step_m`.
+    """Return the number of equal parts, one render each, into which to cut a way, none above `max_step_m`.
 
-    At least 1, also for a step of 0 m. A step that exceeds a multiple of `max_step_m` by
+    It is at least 1, also for a step of 0 m. A step that exceeds a multiple of `max_step_m` by
     rounding alone (relative 1e-9) is not divided further.
 
     Raises:
-        ValueError: If step_m is negative or max_step_m not positive, or step_m is not finite.
+        ValueError: step_m is negative or not finite, or max_step_m is not positive.
     """
     if not (0.0 <= step_m < math.inf and max_step_m > 0.0):
         raise ValueError(f"step_m must be finite and >= 0, max_step_m > 0; got {step_m}, {max_step_m}")
@@ -136,18 +136,18 @@ def sub_renders(step_m: float, max_step_m: float) -> int:
 
 @numba.njit(cache=True, error_model="numpy")
 def parts_of(step_m: float, max_step_m: float) -> int:
-    """`sub_renders` without checks."""
+    """Compute `sub_renders` without checks."""
     return max(1, math.ceil(step_m / max_step_m * (1.0 - 1e-9)))
 
 
 def _max_step_m(config: EnvConfig, scene: Scene, by_looks: bool) -> float:
     """Return the longest way between two renders [m], from a fit of the renders per control step.
 
-    Between looks the light of a pixel is taken as linear in time, so an event is late or early
-    within an interval; it may be so by 5 % of a control step. What a pixel sees changes faster the
-    farther a step leads and the smaller the pixel. Of a high threshold fewer crossings are left,
-    and those are the uncertain ones. What is behind a photoreceptor of limited bandwidth changes
-    exponentially, so at tolerance 0.05 a step of more than two time constants takes two renders.
+    Between looks the light of a pixel is taken as linear in time, so an event may be early or late
+    within the interval; up to 5 % of a control step is accepted. A pixel's light changes faster in
+    longer steps and in smaller pixels. A high threshold leaves fewer crossings, and they are the
+    uncertain ones. The response of a photoreceptor of limited bandwidth changes exponentially, so
+    at tolerance 0.05 a step of more than two time constants takes two renders.
     """
     step_m = config.speed_mps / config.control_hz
     renders = _renders_by_looks(config, scene) if by_looks else _renders_alone(step_m, scene)
@@ -157,10 +157,10 @@ def _max_step_m(config: EnvConfig, scene: Scene, by_looks: bool) -> float:
 
 
 def _max_shifts_px(config: EnvConfig, scene: Scene) -> Shifts:
-    """Return how far outlines may move between two looks at their columns, from a fit of the event error.
+    """Return the largest motion of outlines between two looks [pixels], from a fit of the event error.
 
-    An event may be late by 5 % of a control step, so outlines may move less in a shorter one. The
-    rest as in `_max_step_m`.
+    An event may be late by 5 % of a control step, so outlines may move less in a shorter step. Otherwise as
+    in `_max_step_m`.
     """
     share = config.speed_mps / config.control_hz / 0.1
     factor = _renders_factor(config) * (RENDERS_TEXTURED if scene.obstacle_texture.sharp else 1.0)
@@ -172,7 +172,7 @@ def _max_shifts_px(config: EnvConfig, scene: Scene) -> Shifts:
 
 
 def _renders_factor(config: EnvConfig) -> float:
-    """Return the factor of renders against tolerance 0.05, threshold 0.2 and `FOCAL_PIXELS`."""
+    """Return the factor on renders relative to tolerance 0.05, threshold 0.2 and `FOCAL_PIXELS`."""
     tolerance, threshold = config.fidelity.tolerance, config.camera.contrast_threshold
     focal = 0.5 * config.camera.width / math.tan(0.5 * math.radians(config.camera.fov_deg))
     factor = max(1.0, focal / FOCAL_PIXELS) ** 0.5 * max(1.0, threshold / 0.2) ** 0.4
@@ -180,12 +180,15 @@ def _renders_factor(config: EnvConfig) -> float:
 
 
 def _renders_alone(step_m: float, scene: Scene) -> float:
-    """Return the renders of a control step at tolerance 0.05 for a camera that renders whole images only."""
+    """Return the renders per control step at tolerance 0.05 for a camera that renders only whole images."""
     return (3.19 + 1.8 * (step_m / 0.1)) * (1.0 if _plain(scene) else RENDERS_TEXTURED)
 
 
 def _renders_by_looks(config: EnvConfig, scene: Scene) -> float:
-    """Return the renders beyond looks at columns, which follow all edges but the ground's, and no noise."""
+    """Return the renders of whole images that a camera needs in addition to looks at columns.
+
+    Looks follow all edges except those of the ground's texture, and they do not follow noise.
+    """
     ground, renders = scene.ground_texture, 0.75
     for texture in (ground, scene.wall_texture):
         share = (config.speed_mps + math.hypot(*texture.velocity_mps)) / config.control_hz / 0.1
@@ -197,10 +200,11 @@ def _renders_by_looks(config: EnvConfig, scene: Scene) -> float:
 
 
 def _cull_m(tolerance: float, scene: Scene) -> float:
-    """Return the distance [m] beyond which obstacles add at most 5 % of the tolerance; inf if none is there.
+    """Return the culling distance [m] beyond which obstacles add at most 5 % of the tolerance.
 
-    Leaving out what is farther than d adds an error of up to 0.05 (32 m / d)^2 in a long lane
-    of poles, be they 0.5 or 2 m wide and the image 16 or 200 pixels: what is far moves slowly.
+    It is inf if no obstacle is farther away. Leaving out obstacles farther than d adds an error of up to
+    0.05 (32 m / d)^2 in a long lane of poles, whether they are 0.5 or 2 m wide and the image 16 or 200
+    pixels, because distant obstacles move slowly.
     """
     cull_m = CULL_M * math.sqrt(0.05 / tolerance)
     last_m = max([scene.obstacles["y"].max(initial=0.0), *(one.places_m[:, 1].max() for one in scene.movers)])
@@ -209,7 +213,7 @@ def _cull_m(tolerance: float, scene: Scene) -> float:
 
 
 def _samples(config: EnvConfig, scene: Scene, renderer: str) -> int:
-    """Return the anti-aliasing whose error is a small part of the tolerance; short steps need more."""
+    """Return the samples whose error is a small part of the tolerance; shorter steps need more samples."""
     tolerance = config.fidelity.tolerance
     if renderer == "pyrender":
         return next(samples for least, samples in PYRENDER_SAMPLES if tolerance >= least)
@@ -228,7 +232,7 @@ def _samples(config: EnvConfig, scene: Scene, renderer: str) -> int:
 
 
 def _only_spheres(scene: Scene) -> bool:
-    """Whether `envs.raycast.discs` draws all that can be seen of a scene."""
+    """Whether `envs.raycast.discs` can draw everything visible in a scene."""
     bodies = np.concatenate([scene.obstacles, np.array([one.body for one in scene.movers], OBSTACLE)])
     round_ = (bodies["kind"] == ELLIPSOID) & (bodies["rx"] == bodies["ry"]) & (bodies["ry"] == bodies["rz"])
     return _plain(scene) and bool(round_.all()) and scene.wall_height_m <= LOW_WALL_M

@@ -11,7 +11,7 @@ from envs.scene.collision import first_contact, first_moving_contact
 
 SPLITS = ("train", "validation", "eval")
 NUM_ACTIONS = 3  # forward, left 45 degrees, right 45 degrees
-MIRRORED_ACTIONS = [0, 2, 1]  # each one's action with left and right exchanged
+MIRRORED_ACTIONS = [0, 2, 1]  # each action with left and right exchanged
 DIAGONAL = math.sqrt(0.5)
 GOAL_REWARD, COLLISION_REWARD = 100.0, -100.0
 SEED_STRIDE = 2**32
@@ -23,7 +23,7 @@ class Lane(NamedTuple):
     """A vehicle and the lane in which it flies.
 
     Attributes:
-        radius_m: Of the vehicle, a level disc [m].
+        radius_m: Radius of the vehicle, a level disc [m].
         half_width_m: The walls are at x = +-half_width_m [m].
         length_m: The goal line is at y = length_m [m].
     """
@@ -37,10 +37,10 @@ class Outcome(NamedTuple):
     """Result of one control step.
 
     Attributes:
-        end: Where the vehicle is after it, x and y [m].
-        share: Share of the step that it moved.
+        end: Position of the vehicle after the step, x and y [m].
+        share: Share of the step in which the vehicle moved.
         reward: Metres of progress along y, with the bonus or the penalty.
-        success, collision: What ended the episode; at most one of them.
+        success, collision: Whether the goal line or a contact ended the episode; at most one is True.
     """
 
     end: Point
@@ -53,18 +53,18 @@ class Outcome(NamedTuple):
 def random_streams(split: str, seed: int, episode: int) -> tuple[np.random.Generator, ...]:
     """Return the random generators of an episode's scene, spawn, faults and condition.
 
-    The split comes first in their entropy, so no seed makes a corridor of another split. The
-    seed comes last: it may be longer than a word, and what followed it would run into its end.
+    The split comes first in the entropy, so no seed gives a corridor of another split. The seed
+    comes last, because it may be longer than one word and would make later entries ambiguous.
     """
     streams = np.random.SeedSequence([SPLITS.index(split), episode, seed]).spawn(4)
     return tuple(np.random.default_rng(stream) for stream in streams)
 
 
 def choose_episode(following: int, options: Mapping[str, object]) -> int:
-    """Return the episode that reset `options` ask for, or the `following` one.
+    """Return the episode number in the reset `options`, or else `following`.
 
     Raises:
-        ValueError: An unknown option, or an episode that is no integer >= 0.
+        ValueError: An option is unknown, or the episode number is not an integer >= 0.
     """
     episode = options.get("episode_number", following)
     if options.keys() - {"episode_number"} or not isinstance(episode, int | np.integer) or episode < 0:
@@ -75,11 +75,11 @@ def choose_episode(following: int, options: Mapping[str, object]) -> int:
 def spread_seeds(seed: int | Sequence[int | None] | None, count: int) -> list[int | None]:
     """Return one seed for each of `count` environments.
 
-    One number makes seed + i * 2**32 for environment i: workers with neighbouring seeds
-    then never get the same corridors, as they would with seed + i.
+    One number gives seed + i * 2**32 for environment i. With seed + i, workers with neighbouring seeds
+    would get the same corridors.
 
     Raises:
-        ValueError: There are several seeds, but not `count`.
+        ValueError: The number of seeds is not `count`.
     """
     if seed is None:
         return [None] * count
@@ -92,20 +92,20 @@ def spread_seeds(seed: int | Sequence[int | None] | None, count: int) -> list[in
 
 @numba.njit(cache=True, error_model="numpy")
 def clock_us(step: int, control_hz: float) -> int:
-    """Return the simulated time at the end of a control step [us]; from the count, so it does not drift."""
+    """Return the simulated time at the end of a control step [us], without drift, from the step count."""
     return round(step * 1e6 / control_hz)
 
 
 @numba.njit(cache=True, error_model="numpy")
 def planned_position(spawn_x_m: float, moves: tuple[int, int, int], step_m: tuple[float, float]) -> Point:
-    """Return the place to which all moves so far lead, x and y [m].
+    """Return the place after all moves so far, x and y [m].
 
-    One product of whole counts, so that no error adds up: 1000 steps of 0.1 m are 100 m.
+    It is one product of integer counts, so errors do not add up: 1000 steps of 0.1 m are 100 m.
 
     Args:
-        spawn_x_m: Where the episode began; y was 0 [m].
-        moves: How often each action was taken.
-        step_m: Speed [m/s] and control rate [Hz], whose quotient is the way of a step.
+        spawn_x_m: x at the start of the episode; y is 0 [m].
+        moves: Number of times each action was taken.
+        step_m: Speed [m/s] and control rate [Hz]; their quotient is the length of a step.
     """
     forward, left, right = moves
     speed_mps, control_hz = step_m
@@ -121,7 +121,7 @@ def advance(lane: Lane, sections: np.ndarray, start: Point, planned: Point) -> O
 
     Args:
         lane: `Lane`.
-        sections: (M, 7), what stands in it, as `envs.scene.Scene.sections` gives it.
+        sections: (M, 7), sections of the standing bodies, from `envs.scene.Scene.sections`.
         start: x and y [m].
         planned: x and y [m].
     """
@@ -134,12 +134,12 @@ def advance(lane: Lane, sections: np.ndarray, start: Point, planned: Point) -> O
 def advance_among(
     lane: Lane, still_and_moving: tuple, shares: tuple[float, float], start: Point, planned: Point
 ) -> Outcome:
-    """`advance` where bodies move too.
+    """Do the same as `advance`, with moving bodies.
 
     Args:
         lane: `Lane`.
-        still_and_moving: (M, 7) sections that stand, and those that move, as `first_moving_contact` has them.
-        shares: The parts of the control step that have passed at `start` and at `planned`.
+        still_and_moving: Standing sections, (M, 7), and moving sections as for `first_moving_contact`.
+        shares: Fractions of the control step that have passed at `start` and at `planned`.
         start: x and y [m].
         planned: x and y [m].
     """
@@ -152,9 +152,9 @@ def advance_among(
 
 @numba.njit(cache=True, error_model="numpy")
 def _until(lane: Lane, contact: float, start: Point, planned: Point) -> Outcome:
-    """Move from `start` towards `planned` until a share of the way, `contact`, or the goal line."""
+    """Move from `start` towards `planned` until `contact`, a share of the way, or the goal line."""
     goal = math.inf
-    if planned[1] > start[1]:  # a vehicle that stands or flies back does not reach it
+    if planned[1] > start[1]:  # a vehicle that stands or flies back does not reach the goal line
         goal = (lane.length_m - start[1]) / (planned[1] - start[1])
     share = min(contact, goal, 1.0)
     collision = contact <= share
@@ -174,7 +174,7 @@ def follow(lane: Lane, still_and_moving: tuple, way: np.ndarray) -> Outcome:
 
     Args:
         lane: `Lane`.
-        still_and_moving: As of `advance_among`.
+        still_and_moving: As for `advance_among`.
         way: (N + 1, 2), places at the ends of the N parts [m].
     """
     last, parts = len(way) - 1, 0

@@ -15,11 +15,10 @@ def observation_space(config: EnvConfig) -> spaces.Space:
     """Return the space of the observation that `config.observation` names.
 
     Returns:
-        "window": int32 (capacity + 1, 4), see `envs.events.pack_window`, or (N + 1, 4) of all N
-        events where the capacity is None; "event_image":
-        uint8 (H, W, 1); "luminance": float32 (H, W, 1); "events": rows [t [us], x, y, p], int64;
-        "none": uint8 (0,). Pictures have a channel axis because the networks of other libraries,
-        such as stable-baselines3's CnnPolicy, take nothing else for a picture.
+        "window": int32 (capacity + 1, 4), see `envs.events.pack_window`, or (N + 1, 4) for N events if the
+        capacity is None; "event_image": uint8 (H, W, 1); "luminance": float32 (H, W, 1); "events": rows
+        [t [us], x, y, p], int64; "none": uint8 (0,). Pictures have a channel axis because the networks of
+        other libraries, such as stable-baselines3's CnnPolicy, require one.
     """
     shape = (config.camera.height, config.camera.width, 1)
     if config.observation == "window":
@@ -37,10 +36,10 @@ def observation_space(config: EnvConfig) -> spaces.Space:
 
 
 def observe(config: EnvConfig, events: np.ndarray, luminance: np.ndarray) -> np.ndarray:
-    """Return the observation of one control step as a fresh array; windows are packed elsewhere.
+    """Return the observation of one control step as a fresh array; `envs.events.windows` packs windows.
 
     Args:
-        config: Says which.
+        config: Settings that name the observation.
         events: EVENT of the step, valid and in time order.
         luminance: float32 (H, W), the last render.
     """
@@ -54,7 +53,7 @@ def observe(config: EnvConfig, events: np.ndarray, luminance: np.ndarray) -> np.
 
 
 def picture(events: np.ndarray, luminance: np.ndarray) -> np.ndarray:
-    """Draw luminance (gamma 2.2) and events side by side, ON blue and OFF orange, four times enlarged.
+    """Draw luminance (gamma 2.2) and events side by side, enlarged four times; ON is blue, OFF orange.
 
     Args:
         events: EVENT in time order.

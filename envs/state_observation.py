@@ -12,11 +12,11 @@ Observation = dict[str, Any]
 
 
 class StateObservation(gymnasium.Wrapper):
-    """Shows a Dict: "events", the observation of the wrapped environment, and "state".
+    """Wrapper with a Dict observation: "events", the observation of the wrapped environment, and "state".
 
-    The state is float32 (2 + C,): measured velocity to the right and ahead [m/s], whose noise is
-    `EnvConfig.velocity_noise_mps`, and the C numbers of the command that was decided last, 0 at the start.
-    Of a Discrete it is the action's number, -1 at the start.
+    The state is float32 (2 + C,): measured velocity to the right and ahead [m/s], with noise of
+    `EnvConfig.velocity_noise_mps`, and the C numbers of the last command, 0 at the start. For a Discrete
+    action space the command is the action's number, -1 at the start.
     """
 
     def __init__(self, env: gymnasium.Env) -> None:

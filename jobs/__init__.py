@@ -1,4 +1,4 @@
-"""Jobs: what spends the compute and writes down what happened. Importing this starts nothing."""
+"""The commands that train, evaluate and measure. Importing this package starts nothing."""
 
 import importlib.util
 import sys
@@ -9,7 +9,7 @@ def main() -> int:
     """Run the command `evade`: the launcher of `python -m platform.launch`, from any folder.
 
     The launcher is loaded from its file, because outside the repository root `platform` is the standard
-    library's module. It lies beside this package, or where an installed wheel has its data.
+    library's module. It lies next to this package, or in the data folder of an installed wheel.
     """
     homes = Path(__file__).resolve().parent.parent, Path(sys.prefix) / "share" / "evade"
     launcher = next((home for home in homes if (home / "conf").is_dir()), homes[0]) / "platform" / "launch.py"

@@ -2,12 +2,12 @@
 
     observation --feature, once per step--> stack of the last ones --network--> logits and value
 
-To add a kind of policy: a row in `KINDS`, a module with its feature and network unless existing ones do,
-and `conf/model/NAME.yaml` with its settings. A network with sizes of its own brings the dataclass of its
-settings. A row names features and networks as "module:attribute", so that a configuration is checked
+To add a kind of policy, add a row to `KINDS`, a module with its feature and network unless existing ones
+suffice, and `conf/model/NAME.yaml` with its settings. A network with sizes of its own also needs a dataclass
+of its settings. Rows name features and networks as "module:attribute", so that a configuration can be checked
 without importing torch.
 
-The ranges of all settings stand here; configurations, encoder files and policy folders share them.
+This module defines the ranges of all settings for configurations, encoder files and policy folders.
 """
 
 import dataclasses
@@ -38,8 +38,8 @@ Rows = Annotated[list[Annotated[int, Field(ge=0, le=4096)]], Field(max_length=65
 Size = Annotated[int, Field(ge=1, le=65536)]
 TimesMs = Annotated[list[Annotated[float, Field(gt=0, le=1e6)]], Field(max_length=16)]
 
-MAX_ROW_TIME_BINS = 1 << 15  # of an encoder that PPO trains on: events are kept as rows of int16
-MIN_IMAGE = 36  # pixels, of the picture that leaves the third convolution of `nature_layers` one pixel
+MAX_ROW_TIME_BINS = 1 << 15  # for a fine-tuned encoder, whose events are stored as rows of int16
+MIN_IMAGE = 36  # pixels; the smallest side for which the third convolution of `nature_layers` outputs a pixel
 
 
 def _of_a_kind(name: str) -> str:
@@ -53,7 +53,7 @@ KindName = Annotated[str, AfterValidator(_of_a_kind)]
 
 @dataclass(frozen=True, config=STRICT)
 class EvaeSettings:
-    """Settings of an event VAE; `models.encoder.evae.EventVAE` says what each means."""
+    """Settings of an event VAE, documented in `models.encoder.evae.EventVAE`."""
 
     variant: Variant
     width: Side
@@ -74,11 +74,11 @@ class EvaeSettings:
 
 
 class Model:
-    """What the settings of every kind of policy have.
+    """Settings common to all kinds of policy.
 
     Attributes:
         name: The kind.
-        stack: Latest features that the policy reads.
+        stack: Number of latest features that the policy reads.
     """
 
     has_encoder: ClassVar[bool] = False
@@ -142,7 +142,7 @@ class EncoderModel(Model):
         return self
 
     def evae(self, width: int, height: int) -> EvaeSettings:
-        """Return settings of its event VAE on a sensor of so many pixels."""
+        """Return the settings of its event VAE for a sensor of width x height pixels."""
         own = (self.context, self.latent, self.norm, self.target, self.time_bins, self.coding)
         added = (self.pool_rank, self.octaves)
         return EvaeSettings(cast(Variant, self.name), width, height, *own, *added)
@@ -165,9 +165,9 @@ class ColumnsModel(DenseModel):
     """A policy whose dense layers read event counts per image column; see `EncoderModel`.
 
     Attributes:
-        bands: Rows at which horizontal bands of the image begin and, the last, end; each band has counts of
-            its own, and rows outside are not seen. None: the whole image is one band. Several bands see how
-            high something is, which matters where bodies hang in the air.
+        bands: Rows at which the horizontal bands of the image start, and the row at which the last one ends.
+            Each band has its own counts; other rows are not seen. Empty: the whole image is one band. Several
+            bands show how high an object is, which matters if obstacles hang in the air.
     """
 
     bands: Rows = dataclasses.field(default_factory=list)
@@ -189,11 +189,11 @@ class FixedModel(Model):
 
 @dataclass(frozen=True, config=STRICT)
 class RecurrentModel(Model):
-    """A policy whose network remembers by itself, as a GRU (Cho et al. 2014).
+    """A policy with a recurrent network, such as a GRU (Cho et al. 2014).
 
     Attributes:
-        units: Numbers of its state.
-        own_actions, own_velocity: As of `EncoderModel`.
+        units: Size of its state.
+        own_actions, own_velocity: See `EncoderModel`.
     """
 
     name: KindName
@@ -204,16 +204,16 @@ class RecurrentModel(Model):
 
 
 class Kind(NamedTuple):
-    """How a policy turns observations into decisions.
+    """A kind of policy: the parts that turn observations into actions.
 
     Attributes:
-        observation: What the environment shows it (`envs.observations`).
-        feature: What is kept of each step, a `models.policy.features.Feature`.
-        network: What reads the stack of features, a `models.policy.networks.Network`.
-        settings: The dataclass of its settings, which says whether it has an event VAE.
-        onnx: The feature as a function of tensors, as in `models.policy.onnx`; None: no ONNX export.
-        min_side: Smallest side of the sensor that its network takes [pixels].
-        finetuning: Whether PPO may train its encoder on (`encoder: finetuned`).
+        observation: Name of the observation that it needs (`envs.observations`).
+        feature: Reference to the feature stored for each step, a `models.policy.features.Feature`.
+        network: Reference to the network that reads the features, a `models.policy.networks.Network`.
+        settings: The dataclass of its settings, which also defines whether it has an event VAE.
+        onnx: Reference to the feature as a function of tensors (`models.policy.onnx`); None: no ONNX export.
+        min_side: Smallest side of the sensor that its network supports [pixels].
+        finetuning: Whether PPO may fine-tune its encoder (`encoder: finetuned`).
     """
 
     observation: str
@@ -280,7 +280,7 @@ KINDS = {
         min_side=MIN_IMAGE,
     ),
 }
-# Settings that older files lack, each with the value that does what was done before it existed.
+# Settings that older files lack, each with the value that gives the behaviour of the older version.
 ADDED_MODEL_SETTINGS: dict[str, object] = {
     "memory_ms": [],
     "pool_rank": 1,
@@ -298,12 +298,12 @@ RENAMED = {
 
 
 class TrialError(ValueError):
-    """A feature or a network that does not do what its row says."""
+    """The results of a feature or network do not match its row in `KINDS`."""
 
 
 @dataclass(frozen=True, config=STRICT)
 class PolicySpec:
-    """All that a policy's networks are built from.
+    """Everything needed to build a policy's networks.
 
     Attributes:
         model: Settings of its kind.
@@ -318,7 +318,7 @@ class PolicySpec:
 
     @property
     def kind(self) -> Kind:
-        """Return the row in `KINDS`, with another feature and network if PPO trains the encoder on."""
+        """Return the row in `KINDS`; with a fine-tuned encoder it has another feature and network."""
         kind = KINDS[self.model.name]
         if not self.finetuned:
             return kind
@@ -326,20 +326,20 @@ class PolicySpec:
 
     @property
     def finetuned(self) -> bool:
-        """Whether PPO trains the encoder on, as a part of the networks."""
+        """Whether PPO fine-tunes the encoder as part of the networks."""
         return isinstance(self.model, EncoderModel) and self.model.encoder == "finetuned"
 
     @property
     def frozen(self) -> bool:
-        """Whether its features come from a frozen encoder, which has a file of its own."""
+        """Whether its features come from a frozen encoder, which is stored in its own file."""
         return self.model.has_encoder and not self.finetuned
 
     @property
     def evae(self) -> EvaeSettings:
-        """Return settings of its event VAE.
+        """Return the settings of its event VAE.
 
         Raises:
-            ValueError: It has none.
+            ValueError: It has no event VAE.
         """
         if not isinstance(self.model, EncoderModel):
             raise ValueError(f"{self.model.name} has no event VAE")
@@ -352,27 +352,27 @@ class PolicySpec:
 
     @property
     def bands(self) -> list[int]:
-        """Return the rows at which the bands of its columns begin, and the end of the last."""
+        """Return the rows at which its bands start, and the row at which the last one ends."""
         return list(getattr(self.model, "bands", [])) or [0, self.height]
 
     @property
     def own_actions(self) -> bool:
-        """Return whether it also sees the action that it took last."""
+        """Whether it also sees its last action."""
         return bool(getattr(self.model, "own_actions", False))
 
     @property
     def own_velocity(self) -> bool:
-        """Return whether it also sees the velocity that the vehicle measures."""
+        """Whether it also sees the velocity that the vehicle measures."""
         return bool(getattr(self.model, "own_velocity", False))
 
     @property
     def own_size(self) -> int:
-        """Return how many numbers about its vehicle are appended to each feature."""
+        """Return the number of values about the vehicle (action, velocity) appended to each feature."""
         return self.num_actions * self.own_actions + 2 * self.own_velocity
 
     @property
     def depth(self) -> int:
-        """Return features that it keeps of an episode, as `models.policy.memory` does."""
+        """Return the number of features (or means) stored per episode, see `models.policy.memory`."""
         return 1 + len(self.memory_ms) if self.memory_ms else self.model.stack
 
     @property
@@ -380,7 +380,7 @@ class PolicySpec:
         """Return the neurons of each of its dense layers.
 
         Raises:
-            ValueError: It has none.
+            ValueError: It has no dense layers.
         """
         if not hasattr(self.model, "hidden"):
             raise ValueError(f"{self.model.name} has no dense layers")
@@ -393,10 +393,10 @@ class PolicySpec:
 
 
 def find_kind(name: object) -> Kind:
-    """Return the kind of a name.
+    """Return the kind with this name.
 
     Raises:
-        ValueError: There is none of this name.
+        ValueError: There is no such kind.
     """
     if not isinstance(name, str) or name not in KINDS:
         checked(read_model, {"name": name})  # raises
@@ -404,7 +404,7 @@ def find_kind(name: object) -> Kind:
 
 
 def needed_plugins(manifest: Mapping[str, object]) -> str:
-    """Return what to add to the refusal of a policy whose training had plug-ins; empty for any other."""
+    """Return a hint for an error message if the policy was trained with plug-ins, else an empty string."""
     plugins = manifest.get("plugins")
     if not isinstance(plugins, Mapping) or not plugins:
         return ""
@@ -412,13 +412,13 @@ def needed_plugins(manifest: Mapping[str, object]) -> str:
 
 
 def renamed(name: object) -> str:
-    """Return what to add to the refusal of a kind's name of an earlier version; empty for any other name."""
+    """Return a hint for an error message if a kind has been renamed, else an empty string."""
     now = RENAMED.get(name) if isinstance(name, str) else None
     return f", which is called {now} now" if now else ""
 
 
 def read_model(**values: object) -> Model:
-    """Return the settings of a model, checked; `name` says which kind it is, and so which settings it has.
+    """Return the checked settings of a model; `name` selects the kind and thus the settings that it has.
 
     Raises:
         pydantic.ValidationError: A setting is missing, unknown to this kind, or has a wrong value.
@@ -429,13 +429,13 @@ def read_model(**values: object) -> Model:
 
 
 def model_keys(*kinds: str) -> list[str]:
-    """Return the settings of some kinds, of all if none is named."""
+    """Return the names of the settings of these kinds, or of all kinds if none is given."""
     sections: list[Any] = [KINDS[name].settings for name in kinds or KINDS]
     return list(dict.fromkeys(field.name for section in sections for field in dataclasses.fields(section)))
 
 
 def read_spec(values: Mapping[str, object]) -> PolicySpec:
-    """Return the specification of a manifest, which may hold more than that.
+    """Read a policy's specification from a manifest, whose other keys are ignored.
 
     Raises:
         ValueError: A setting is missing, of another type or out of its range; the message names it.
@@ -455,10 +455,10 @@ def read_spec(values: Mapping[str, object]) -> PolicySpec:
 
 
 def checked(section: Callable[..., T], values: Mapping[str, object]) -> T:
-    """Return the dataclass of some values.
+    """Create a dataclass from values.
 
     Raises:
-        ValueError: On one line, each setting that was refused, with the rule and the value.
+        ValueError: A setting is invalid. The message lists each one with its rule and value on one line.
     """
     try:
         return section(**values)
@@ -467,7 +467,7 @@ def checked(section: Callable[..., T], values: Mapping[str, object]) -> T:
 
 
 def _check_coding(name: str, coding: str, pool_rank: int, octaves: int) -> None:
-    """Raise ValueError for a code of time, a rank or octaves that this encoder cannot have."""
+    """Raise ValueError if this encoder cannot have this time coding, pool rank or number of octaves."""
     if coding == "eventnet" and name != "bytestream":
         raise ValueError(f"coding must be additive or none for {name}, which has no time, got 'eventnet'")
     if pool_rank > 1 and (coding == "eventnet" or name == "event_image_vae"):
@@ -478,7 +478,7 @@ def _check_coding(name: str, coding: str, pool_rank: int, octaves: int) -> None:
 
 
 def _one_line(problem: Mapping[str, Any]) -> str:
-    """Return a refusal of pydantic's, with key, rule and value."""
+    """Format one of pydantic's errors as key, rule and value."""
     key = ".".join(str(part) for part in problem["loc"])
     if problem["type"] == "value_error":
         return f"{key} {problem['msg'].removeprefix('Value error, ')}".strip()

@@ -1,4 +1,4 @@
-"""Stands in for the standard library's `platform`; its text replaces this one at import.
+"""Stand-in for the standard library's `platform`, whose docstring replaces this one at import.
 
 The repository's entry point is `python -m platform.launch`, so this folder hides the
 standard library's module from every program run in the repository root. It therefore
@@ -8,7 +8,7 @@ with only `__path__` added, so that pickles, reloads and `isinstance` keep worki
 
 
 def _become_the_standard_library_module():
-    """Execute the first plain module (not a package, as this is) of this name on `sys.path`."""
+    """Execute the first plain module (not a package, like this one) of this name on `sys.path`."""
     import sys
     from importlib.machinery import PathFinder
 

@@ -1,7 +1,7 @@
 """Install pinned packages into the environment of this Python: python platform/install.py LOCK ...
 
-uv does it with less than half of pip's work, and takes torch without CUDA's libraries where there is no
-GPU. pip does it where uv cannot be had, fails, or lacks one of pip's settings on this machine.
+uv needs less than half of pip's work, and installs torch without CUDA's libraries if there is no GPU. pip is
+used if uv is not available, fails, or does not support one of pip's settings on this machine.
 """
 
 import ast
@@ -11,7 +11,7 @@ import sys
 from collections.abc import Mapping
 
 UV = "uv==0.13.9"
-# pip's settings and the variables by which uv knows them.
+# pip's settings, and the variables of uv for the same settings.
 SAME = {
     "cert": "SSL_CERT_FILE",
     "constraint": "UV_CONSTRAINT",
@@ -21,8 +21,8 @@ SAME = {
     "index-url": "UV_DEFAULT_INDEX",
     "timeout": "UV_HTTP_TIMEOUT",
 }
-PLACES = {"find-links", "index-url", "extra-index-url"}  # whoever sets one says where torch comes from
-# pip's settings that change nothing of what is installed.
+PLACES = {"find-links", "index-url", "extra-index-url"}  # if one is set, it says where torch comes from
+# pip's settings that do not affect what is installed.
 WITHOUT_EFFECT = {
     *("break-system-packages", "disable-pip-version-check", "no-cache-dir", "no-compile", "no-input"),
     *("progress-bar", "quiet", "require-virtualenv", "retries", "root-user-action", "verbose"),
@@ -43,7 +43,7 @@ def main(locks: list[str]) -> int:
 
 
 def pip_settings() -> dict[str, str]:
-    """Return pip's settings from files and variables, the strongest last."""
+    """Return pip's settings from files and variables; a later one overrides an earlier one."""
     command = [sys.executable, "-m", "pip", "config", "list", "--disable-pip-version-check"]
     lines = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
     pairs = [line.partition(".")[2].partition("=") for line in lines]
@@ -51,10 +51,10 @@ def pip_settings() -> dict[str, str]:
 
 
 def uv_settings(settings: Mapping[str, str]) -> dict[str, str] | None:
-    """Return the variables that make uv take the packages that pip would; None if there are none such.
+    """Return the variables with which uv installs the same packages as pip; None if there are none.
 
     Args:
-        settings: Names and values as `pip config list` has them.
+        settings: Names and values as `pip config list` prints them.
     """
     if settings.keys() - SAME.keys() - WITHOUT_EFFECT:
         return None
@@ -63,7 +63,7 @@ def uv_settings(settings: Mapping[str, str]) -> dict[str, str] | None:
         same["UV_FIND_LINKS"] = ",".join(same["UV_FIND_LINKS"].split())
     if settings.keys().isdisjoint(PLACES):
         same["UV_TORCH_BACKEND"] = "auto"  # CUDA's libraries only where there is a GPU
-    return same | {"UV_INDEX_STRATEGY": "unsafe-best-match"}  # as pip: the best version of all places
+    return same | {"UV_INDEX_STRATEGY": "unsafe-best-match"}  # like pip: the best version from all places
 
 
 if __name__ == "__main__":

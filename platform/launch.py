@@ -29,18 +29,18 @@ from jobs.run.undo import undo
 from jobs.run.variables import variables_set
 
 ENVIRONMENT = "give `make setup`, then `source .venv/bin/activate` and the same command"
-# They take entries that conf/ does not have.
+# Groups that accept keys that conf/ does not have.
 OPEN_GROUPS = ("env.layout", "env.body", "faults.added", "study.axes", "search.space")
-UNWRITABLE = {  # what the operating system says: what to do
+UNWRITABLE = {  # error of the operating system: remedy
     errno.ENOSPC: "make room there",
     errno.EDQUOT: "make room there",
     errno.EACCES: "give yourself the right to use it",
     errno.EPERM: "give yourself the right to use it",
     errno.EROFS: "make the file system writable",
 }
-JOBS_HERE = "  <jobs>"  # in conf/hydra/help
+JOBS_HERE = "  <jobs>"  # placeholder in conf/hydra/help
 DONE, FAILED, WRONG_VALUE = 0, 1, 2
-ENDED = 128  # and the number of the signal
+ENDED = 128  # plus the number of the signal
 
 
 def main() -> int:
@@ -49,7 +49,7 @@ def main() -> int:
     end_on_signals()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="replace")  # a terminal that takes ASCII alone shows a question mark
+            stream.reconfigure(errors="replace")  # an ASCII terminal shows a question mark
     if importlib.util.find_spec("hydra") is None:
         print(
             f"evade: failed: {sys.executable} has not the packages of Evade; {ENVIRONMENT}", file=sys.stderr
@@ -62,7 +62,7 @@ def main() -> int:
     except KeyboardInterrupt as error:
         number = signal_of(error)
         ended = "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"
-        with contextlib.suppress(OSError):  # a terminal that is closed
+        with contextlib.suppress(OSError):  # the terminal may be closed
             print(f"evade: {ended}; the same command continues where it stopped", file=sys.stderr)
         return ENDED + number
     except Exception as error:
@@ -106,7 +106,7 @@ def compose(words: list[str]) -> dict[str, object] | None:
     given = sys.argv
     sys.argv = [given[0], *words]
     try:
-        # Hydra then raises, instead of printing and leaving.
+        # The variable makes Hydra raise, instead of printing and exiting.
         with variables_set({"HYDRA_FULL_ERROR": "1"}), contextlib.redirect_stdout(answer):
             hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")(keep)()
     except (HydraException, OmegaConfBaseException, ValueError) as error:
@@ -118,7 +118,7 @@ def compose(words: list[str]) -> dict[str, object] | None:
 
 
 def with_jobs(answer: str) -> str:
-    """Return Hydra's help with the list of jobs in its place; other answers as they are."""
+    """Insert the list of jobs into Hydra's help; return other answers unchanged."""
     if JOBS_HERE not in answer:
         return answer
     return answer.replace(JOBS_HERE, "\n".join(f"  {name:<16} {job.summary}" for name, job in JOBS.items()))
@@ -204,9 +204,9 @@ def value_errors(values: object, key: str = "") -> Iterator[str]:
 def report(error: Exception) -> int:
     """Print what went wrong, with a traceback where it helps; return the exit status.
 
-    A ValueError that this repository raises is a wrong value, a RuntimeError a documented failure,
-    and so is a full disk: their messages suffice. HYDRA_FULL_ERROR=1 shows the traceback of those
-    too. Passwords in addresses are never shown.
+    A ValueError raised by this repository means a wrong value; a RuntimeError or a full disk is a
+    documented failure. Their messages suffice; HYDRA_FULL_ERROR=1 also shows their tracebacks.
+    Passwords in addresses are never shown.
     """
     from jobs.config.errors import redacted
     from jobs.config.plugins import one_line
@@ -226,10 +226,10 @@ def report(error: Exception) -> int:
 
 
 def full_disk(error: Exception) -> str | None:
-    """Return the message for a file system's error that a user can mend; None for another error."""
+    """Return the message for an error of the file system that a user can fix; None for another error."""
     if not isinstance(error, OSError) or error.errno not in UNWRITABLE:
         return None
-    where = error.filename2 or error.filename  # the second is what was copied to
+    where = error.filename2 or error.filename  # the second is the target of a copy
     file = f"{where}: " if where else ""
     return f"{file}{os.strerror(error.errno)}; {UNWRITABLE[error.errno]}, and the same command continues"
 

@@ -1,9 +1,9 @@
 """Compare codings of time and sizes of the context in the event encoder, and draw what its latent contains.
 
 Run: python -m platform.launch +exp=codings
-Expect: about 20 minutes on one core beyond the encoder of the run, nearly all of it thirteen short trainings.
-Finished trainings stay in the run folder, so an interrupted command continues. A table and plots in the run
-folder under `trade/`, and in MLflow.
+Expect: about 20 minutes on one core after the run's encoder is trained, mostly for thirteen short trainings.
+Finished trainings are stored in the run folder, so an interrupted command resumes. A table and plots are in
+the run folder under `trade/`, and in MLflow.
 """
 
 import dataclasses
@@ -61,7 +61,7 @@ NEWEST = 0.2
 
 @dataclass(frozen=True, config=STRICT)
 class Settings:
-    """How long the compared encoders are trained, and on how many windows they are measured."""
+    """Settings of the compared encoders: length of the trainings, and number of windows to measure."""
 
     iterations: Count
     seeds: Count
@@ -83,7 +83,7 @@ def run(config: Config) -> dict[str, float]:
 
 
 def trade_contexts(folder: Run, tracker: Tracker, evae: EventVAE) -> None:
-    """Train each size of the context briefly, and measure all encodings together with those of the run."""
+    """Train each size of the context briefly, and measure these encodings together with those of the run."""
     config = folder.config
     models = [trained(folder, {"context": size}, 0) for size in CONTEXTS]
     validation = read_recording(data_file(folder, "validation"))
@@ -101,12 +101,12 @@ def trade_contexts(folder: Run, tracker: Tracker, evae: EventVAE) -> None:
 
 
 def sized_encoding(evae: EventVAE) -> Encoding:
-    """The table of a model of another context size."""
+    """Return the encoding by the table of a model with another context size."""
     return Encoding("context", str(evae.settings.context), encode_whole(EncoderTable.from_evae(evae)), evae)
 
 
 def trade_coding(folder: Run, tracker: Tracker) -> dict[str, float]:
-    """Train each coding of time side by side; return what each explains, as means over seeds."""
+    """Train each coding of time with the same seeds; return the share that each explains, mean over seeds."""
     config, trade = folder.config, folder.config.own
     validation = read_recording(data_file(folder, "validation"))
     shares: dict[str, dict[str, list[float]]] = {coding: {} for coding in CODINGS}
@@ -136,7 +136,7 @@ def trade_coding(folder: Run, tracker: Tracker) -> dict[str, float]:
 
 
 def show_latent(folder: Run, tracker: Tracker, evae: EventVAE) -> dict[str, float]:
-    """Draw the code of time, pictures between latents, and other scenes; return what is explained."""
+    """Draw the code of time, pictures between latents and other scenes; return explained shares per scene."""
     config = folder.config
     publish_plot(folder, tracker, "trade/embedding", plot_embedding())
     validation = read_recording(data_file(folder, "validation"))
@@ -161,10 +161,10 @@ def show_latent(folder: Run, tracker: Tracker, evae: EventVAE) -> dict[str, floa
 
 
 def held_out(config: Config, recording: Recording, grid: Grid, count: int) -> dict[str, EventBatch]:
-    """`count` windows for each condition under which codings of time are compared.
+    """Return `count` windows for each condition under which codings of time are compared.
 
-    "usual": of all lengths, as in training; "sparse" and "dense": of 200 and 2,000 events; then
-    the dense ones with their ages squeezed into the oldest or newest part of the window.
+    "usual": windows of all lengths, as in training; "sparse" and "dense": windows of 200 and 2,000 events;
+    "age over" and "newest fifth": dense windows with ages squeezed into the oldest or newest part.
     """
     drawn = {
         "usual": draw(config, recording, "mixed", MAX_EVENTS, count),
@@ -178,7 +178,7 @@ def held_out(config: Config, recording: Recording, grid: Grid, count: int) -> di
 
 
 def squeezed(batch: EventBatch, youngest: float, oldest: float) -> EventBatch:
-    """The same events in the same order, their ages 0..1 squeezed linearly to `youngest`..`oldest`."""
+    """Return the same events in the same order, with ages 0..1 scaled linearly to `youngest`..`oldest`."""
     bins = batch.grid.time_bins
     age = 1.0 - (batch.bin + 0.5) / bins
     times = 1.0 - (youngest + age * (oldest - youngest))
@@ -186,22 +186,22 @@ def squeezed(batch: EventBatch, youngest: float, oldest: float) -> EventBatch:
 
 
 def spread(values: Sequence[float]) -> tuple[float, float]:
-    """Mean, and half the width of its 95 % interval (Student's t); NaN for a single value."""
+    """Return the mean, and half the width of its 95 % interval (Student's t); NaN for a single value."""
     half = float(half_width(np.array(values))) if len(values) > 1 else float("nan")
     return float(np.mean(values)), half
 
 
 def percent(spread_of: tuple[float, float]) -> str:
-    """A mean and half its interval in percent."""
+    """Return a mean and half its interval as text in percent."""
     mean, half = spread_of
     return f"{100 * mean:.0f}" + ("" if np.isnan(half) else f" ± {100 * half:.0f}")
 
 
 @torch.no_grad()
 def side_by_side(models: Mapping[str, EventVAE], batch: EventBatch, count: int = 2) -> list[np.ndarray]:
-    """Pictures of some windows, each followed by what each model decodes of it: (H, W) each."""
+    """Return pictures (H, W) of some windows, each followed by the decoded picture of every model."""
     places = np.argsort(-np.diff(batch.offsets), kind="stable")[: max(count, len(batch) // 2)]
-    chosen = places[:: len(places) // count][:count]  # of the fuller half, from the fullest on
+    chosen = places[:: len(places) // count][:count]  # from the half with more events, in falling order
     first = next(iter(models.values()))
     parts = [pictures(event_targets(batch, first.target), first.target, batch.grid)]
     for evae in models.values():
@@ -211,7 +211,7 @@ def side_by_side(models: Mapping[str, EventVAE], batch: EventBatch, count: int =
 
 @torch.no_grad()
 def between(evae: EventVAE, batch: EventBatch) -> dict[str, list[np.ndarray]]:
-    """For pairs of full windows whose latents lie far apart: pictures along the line between them."""
+    """Return pictures along the line between latents, for pairs of full windows with distant latents."""
     mu, targets = evae(batch)[1], event_targets(batch, evae.target)
     full = np.argsort(-np.diff(batch.offsets), kind="stable")[:40]
     distance = torch.cdist(mu[full], mu[full]).numpy()
@@ -253,7 +253,7 @@ def plot_codings(spreads: Mapping[str, Mapping[str, tuple[float, float]]]) -> Fi
 
 
 def plot_embedding(context: int = 1024, times: int = 400) -> Figure:
-    """Draw the code of each time of a window, as the paper's figure 6, and a few features of it over time."""
+    """Draw the code of each time of a window, as in the paper's figure 6, and some features over time."""
     figure = Figure(figsize=(11.0, 4.0), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1.6, 1))
     t = (np.arange(times) + 0.5) / times

@@ -1,10 +1,10 @@
-"""How often 95 % intervals over trainings and corridors hold the truth: python -m research.coverage.
+"""Measure the coverage of 95 % intervals over trainings and corridors: python -m research.coverage.
 
-Studies are simulated: the logit of success is a mean, plus a normal effect of each training and of each
-corridor, and episodes are drawn from it; those that fail end anywhere before the goal line. Printed are the
-share of intervals that hold the true rate (of `rate_estimate`) or the true difference, which is 0 (of
-`crossed_difference`, two groups, in success and in distance; of `crossed_mean`, the same trainings once
-more), and the mean width.
+Studies are simulated: the logit of success is a mean plus a normal effect of each training and of each
+corridor. Episodes are drawn from it; failed episodes end uniformly before the goal line. The table has the
+share of intervals that contain the true rate (`rate_estimate`) or the true difference, which is 0
+(`crossed_difference` of two groups, in success and in distance; `crossed_mean` of the same trainings,
+evaluated twice), and the mean width.
 """
 
 from collections.abc import Iterator
@@ -25,7 +25,7 @@ RATE, GOAL_M = (0.0, 1.0), 100.0
 def studies(
     rng: np.random.Generator, trainings: int, corridors: int, mean: float, spread: float
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Successes of two groups of trainings in the same corridors, (trainings, corridors) each."""
+    """Yield the successes of two groups of trainings in the same corridors, (trainings, corridors) each."""
     for _ in range(STUDIES):
         hard = rng.normal(0.0, CORRIDORS, (1, corridors))
         logits = mean + rng.normal(0.0, spread, (2, trainings, 1)) + hard
@@ -34,14 +34,14 @@ def studies(
 
 
 def true_rate(mean: float, spread: float) -> float:
-    """The expected success of a new training in a new corridor."""
+    """Return the expected success of a new training in a new corridor."""
     nodes, weights = np.polynomial.hermite_e.hermegauss(80)
     rates = 1 / (1 + np.exp(-(mean + np.hypot(spread, CORRIDORS) * nodes)))
     return float((weights * rates).sum() / weights.sum())
 
 
 def coverage(trainings: int, corridors: int, mean: float, spread: float) -> tuple[float, float, float, float]:
-    """Shares of intervals of a rate and of a difference that hold the truth, and the mean width of each."""
+    """Return the coverage of intervals of a rate and of a difference, and the mean width of each."""
     rng, truth = np.random.default_rng(0), true_rate(mean, spread)
     held, widths = np.zeros((STUDIES, 2)), np.zeros((STUDIES, 2))
     for study, (ours, theirs) in enumerate(studies(rng, trainings, corridors, mean, spread)):
@@ -53,7 +53,7 @@ def coverage(trainings: int, corridors: int, mean: float, spread: float) -> tupl
 
 
 def distance_coverage(trainings: int, corridors: int, mean: float, spread: float) -> float:
-    """Share of intervals of a difference in distance that hold the true one, 0, of two groups."""
+    """Return the coverage of intervals of the difference in distance of two groups, which is truly 0."""
     rng, ends, held = np.random.default_rng(0), np.random.default_rng(2), 0
     for both in studies(rng, trainings, corridors, mean, spread):
         ours, theirs = (np.where(won > 0, GOAL_M, ends.uniform(0.0, GOAL_M, won.shape)) for won in both)
@@ -63,7 +63,7 @@ def distance_coverage(trainings: int, corridors: int, mean: float, spread: float
 
 
 def change_coverage(trainings: int, corridors: int, mean: float, spread: float) -> float:
-    """Share of intervals that hold 0, of what changes where nothing does: trainings are evaluated twice."""
+    """Return the coverage of intervals of a change that is truly 0: the same trainings, evaluated twice."""
     rng, held = np.random.default_rng(1), 0
     for _ in range(STUDIES):
         logits = mean + rng.normal(0.0, spread, (trainings, 1)) + rng.normal(0.0, CORRIDORS, (1, corridors))

@@ -1,8 +1,8 @@
-"""Why false events break a policy: what each kind of wrong events does to features, latent and action.
+"""Measure how each kind of wrong events changes features, latent and action of a policy.
 
 Run: python -m research.false_events copies
-Expect: seconds. Copies of the ten `bytestream` trainings of ppo_claims that read the same weights otherwise,
-by another rank of the pooling or behind a neighbour filter, in runs/false_events_copies. `+exp=false_events`
+Expect: seconds. Writes copies of the ten `bytestream` trainings of ppo_claims to runs/false_events_copies.
+They have the same weights, and another rank of the pooling or a neighbour filter. `+exp=false_events`
 evaluates them.
 
 Run: python -m research.false_events features
@@ -42,10 +42,10 @@ NAME = "ppo_claims_bytestream"
 COPIES = Path("runs") / "false_events_copies"
 FILE = REPOSITORY / "docs" / "data" / "false_events_features.csv"
 TRAININGS = range(10)
-CORRIDORS = (0, 1)  # that each training flies with nothing changed
-ERROR = 0.1  # event error of each kind: the share of both streams' events without a partner in the other
+CORRIDORS = (0, 1)  # in which each training flies with nothing changed
+ERROR = 0.1  # event error of each kind: share of the events of both streams without a partner in the other
 TAU_US = 5000  # of the neighbour filter, as env.filter_tau_us
-# What reads the same weights otherwise: name -> rank of the pooling and neighbours that the filter asks for.
+# Ways to read the same weights: name -> rank of the pooling, and neighbours that the filter requires.
 READINGS = {
     "maximum": (1, 0),
     "second": (2, 0),
@@ -55,19 +55,19 @@ READINGS = {
     "third_filter_1": (3, 1),
 }
 KINDS = ("invented", "displaced", "lost", "flipped", "one invented")
-OTHERWISE = ("invented", "one invented")  # kinds that every reading meets; the rest meet the maximum alone
+OTHERWISE = ("invented", "one invented")  # kinds for all readings; the others only for `maximum`
 MEASURES = ("changed", "raised", "latent", "action")
-SHOWN = ("raised", "latent", "action")  # on the page; the file has all
+SHOWN = ("raised", "latent", "action")  # on the page; the file has all measures
 HEAD = ("training", "reading", "kind", *MEASURES)
 
 
 class Response(NamedTuple):
-    """What a reading makes of each step of a flight.
+    """The output of a policy at each step of a flight.
 
     Attributes:
-        features: float32 (N, D), of the context.
+        features: Features of the context, float32 (N, D).
         latents: float32 (N, latent).
-        actions: int64 (N,), the likeliest.
+        actions: The most likely actions, int64 (N,).
     """
 
     features: np.ndarray
@@ -76,7 +76,7 @@ class Response(NamedTuple):
 
 
 def write_copies(source: Path, target: Path) -> list[Path]:
-    """Write every training of `NAME` once for each reading but the first; return the folders."""
+    """Write a copy of every training of `NAME` for each reading except `maximum`; return the folders."""
     return [
         write_copy(source / f"{NAME}-s{seed}", target / f"{reading}-s{seed}", rank, support)
         for reading, (rank, support) in READINGS.items()
@@ -86,7 +86,7 @@ def write_copies(source: Path, target: Path) -> list[Path]:
 
 
 def write_copy(source: Path, target: Path, rank: int, support: int) -> Path:
-    """Write a policy with the same weights that reads by `rank`, behind a filter of `support` neighbours."""
+    """Write a policy with the same weights, pooling rank `rank` and a filter of `support` neighbours."""
     shutil.copytree(source, target, dirs_exist_ok=True)
     encoder = without_checksum(json.loads((source / "encoder.json").read_text()))
     encoder["model"]["pool_rank"] = rank
@@ -104,7 +104,7 @@ def write_copy(source: Path, target: Path, rank: int, support: int) -> Path:
 
 
 def fly(folder: Path, seed: int) -> list[Step]:
-    """Return the events of each step of a corridor that a policy flies with nothing changed."""
+    """Return the events of each step of a policy's flight through corridor `seed`, with nothing changed."""
     steps: list[Step] = []
     env = env_with(EnvConfig(**load_policy(folder).env_fields), {"env.scene": "poles_eval"})
 
@@ -119,13 +119,13 @@ def fly(folder: Path, seed: int) -> list[Step]:
 
 
 def wrong(kind: str, step: Step, shape: tuple[int, int], rng: np.random.Generator) -> np.ndarray:
-    """Return the events of a step with wrong ones of a kind among them, at an event error of `ERROR`.
+    """Return the events of a step, changed by one kind of wrong events at an event error of `ERROR`.
 
     Args:
-        kind: Of `KINDS`.
-        step: Its events are of a structured dtype with t, x, y, p.
-        shape: Of the sensor, (height, width).
-        rng: Draws which.
+        kind: One of `KINDS`; "one invented" adds a single event instead.
+        step: Its events have a structured dtype with t, x, y, p.
+        shape: Shape of the sensor, (height, width).
+        rng: Draws the wrong events.
     """
     events = step.events.copy()
     if kind in ("invented", "one invented"):
@@ -150,7 +150,7 @@ def wrong(kind: str, step: Step, shape: tuple[int, int], rng: np.random.Generato
 
 
 def respond(policy: Policy, steps: Sequence[Step]) -> Response:
-    """Return what a policy makes of the steps of one flight, from its first on."""
+    """Return the outputs of a policy over the steps of one whole flight."""
     table = cast(EncoderTable, policy.encoder)
     policy.reset()
     sieve = filter_of(policy.manifest["sensor"], policy.spec.width, policy.spec.height)
@@ -165,7 +165,7 @@ def respond(policy: Policy, steps: Sequence[Step]) -> Response:
 
 
 def compare(clean: Response, changed: Response) -> dict[str, float]:
-    """Return how far wrong events move features, latent and action: shares, and standard deviations."""
+    """Return how far wrong events move features, latent and action: shares, latent in standard deviations."""
     spread = np.maximum(clean.latents.std(axis=0), 1e-9)
     away = (changed.latents - clean.latents) / spread
     return {
@@ -180,8 +180,8 @@ def measure(folders: Mapping[str, Path], seed: int) -> Iterator[tuple[str, str, 
     """Yield reading, kind and `compare` of one training over its flights.
 
     Args:
-        folders: Reading -> the folder of the training; the first flies.
-        seed: Of the training, which also draws the wrong events.
+        folders: Reading -> folder of the training; the first policy flies.
+        seed: Seed of the training, which also draws the wrong events.
     """
     first = next(iter(folders.values()))
     flights = [fly(first, corridor) for corridor in CORRIDORS]
@@ -202,14 +202,14 @@ def measure(folders: Mapping[str, Path], seed: int) -> Iterator[tuple[str, str, 
 
 
 def joined(parts: Sequence[Response]) -> Response:
-    """Return several flights as one."""
+    """Concatenate the responses of several flights."""
     return Response(*(np.concatenate(own) for own in zip(*parts, strict=True)))
 
 
 def table_of(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return means over trainings as Markdown, from the rows of `FILE`; that of actions with its interval.
+    """Return means over trainings as Markdown, from the rows of `FILE`; for actions with an interval.
 
-    The maximum reads every kind of wrong events, the other readings those that break it.
+    `maximum` has a row for every kind of wrong events, the other readings only for "invented".
     """
     places = list(dict.fromkeys((row["reading"], row["kind"]) for row in rows))
     lines = []
@@ -224,7 +224,7 @@ def table_of(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def read_rows(file: Path) -> list[dict[str, str]]:
-    """Return the rows of `FILE`."""
+    """Return the rows of a file like `FILE`."""
     with file.open(newline="") as opened:
         return list(csv.DictReader(opened))
 

@@ -29,12 +29,12 @@ HEAD = ("View [degrees]", "Sight [m]", "Success [%]")
 def in_sight(
     obstacles: np.ndarray, at_m: tuple[float, float, float], sight_m: float, view_deg: float
 ) -> np.ndarray:
-    """Whether a part of each sphere is so near and in view, bool (N,).
+    """Whether a part of each sphere is within `sight_m` and within the field of view, bool (N,).
 
     Args:
         obstacles: (N,) OBSTACLE, spheres.
-        at_m: Where the camera is, x, y and z [m]; it looks along +y.
-        sight_m: How near the surface must be [m].
+        at_m: Position of the camera, x, y and z [m]; it looks along +y.
+        sight_m: Largest distance of the surface [m].
         view_deg: Horizontal field of view [degrees].
     """
     x, y, z = at_m
@@ -48,7 +48,7 @@ def in_sight(
 
 
 def fly(env: CorridorEnv, seed: int, sight_m: float, view_deg: float) -> bool:
-    """Whether the planner reaches the goal by what it has seen."""
+    """Fly with a planner that knows only what it has seen; return whether it reaches the goal."""
     env.reset(seed=seed)
     config, whole = env.config, env.scene
     seen = np.zeros(len(whole.obstacles), bool)

@@ -1,9 +1,9 @@
-"""What a sweep could save by stopping early: python -m research.stopping.
+"""Measure how many episodes a sweep could save by stopping early: python -m research.stopping.
 
-Two groups are compared after each batch of corridors, and no further corridor is evaluated once they differ
-for certain. Printed are how often they are said to differ, and the share of episodes that this takes: by a
-plan that looks once, by one that takes each look for the only one, and by one that shares its 5 % among the
-looks (Bonferroni). The studies are simulated as in `research.coverage`.
+Two groups are compared after each batch of corridors, and evaluation stops at a significant difference. The
+table has how often a difference is reported, and the share of episodes used, for three plans: one look;
+several looks, each tested as if it were the only one; several looks that share the 5 % (Bonferroni). The
+studies are simulated as in `research.coverage`.
 """
 
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ EFFECTS = (0.0, 2.0)  # between the groups [logits]
 
 
 class Plan(NamedTuple):
-    """How often a plan says that the groups differ, over many studies, and the share of episodes it takes."""
+    """Over many studies, how often a plan reports a difference, and the share of episodes it uses."""
 
     decided: float
     episodes: float
@@ -32,14 +32,14 @@ class Plan(NamedTuple):
 def look_p_values(
     rng: np.random.Generator, trainings: int, looks: Sequence[int], spread: float, effect: float
 ) -> np.ndarray:
-    """The p of the difference of two groups at each look of each simulated study, float64 (studies, looks).
+    """Return p of the difference of two groups at each look of simulated studies, float64 (studies, looks).
 
     Args:
         rng: Draws the studies.
-        trainings: Of each group.
-        looks: After how many corridors, rising.
-        spread: Of the trainings' logits.
-        effect: Between the groups [logits].
+        trainings: Trainings per group.
+        looks: Numbers of corridors after which the groups are compared, rising.
+        spread: Standard deviation of the trainings' logits.
+        effect: Difference between the groups [logits].
     """
     found = np.ones((STUDIES, len(looks)))
     for study in range(STUDIES):
@@ -54,12 +54,12 @@ def look_p_values(
 
 
 def stopped(p_values: np.ndarray, looks: Sequence[int], level: float) -> Plan:
-    """A plan that stops at the first look with p below `level`.
+    """Return the result of a plan that stops at the first look with p below `level`.
 
     Args:
-        p_values: Of `look_p_values`.
-        looks: After how many corridors.
-        level: Of each look.
+        p_values: As returned by `look_p_values`.
+        looks: Numbers of corridors after which the groups are compared.
+        level: Significance level of each look.
     """
     below = p_values < level
     decided = below.any(axis=1)
@@ -68,7 +68,7 @@ def stopped(p_values: np.ndarray, looks: Sequence[int], level: float) -> Plan:
 
 
 def plans(trainings: int, looks: Sequence[int], spread: float, effect: float) -> tuple[Plan, Plan, Plan]:
-    """The plan that looks once, the one that takes each look for the only one, and the one that shares."""
+    """Return three plans: one look, several looks without correction, several looks that share the level."""
     p_values = look_p_values(np.random.default_rng(0), trainings, looks, spread, effect)
     level = 1 - CONFIDENCE
     once = stopped(p_values[:, -1:], looks[-1:], level)

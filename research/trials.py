@@ -20,10 +20,10 @@ MAX_EVENTS = 4096
 
 
 def trained(folder: Run, changes: Mapping[str, Any], seed: int) -> EventVAE:
-    """A frozen event VAE after a short training with some settings of the model changed.
+    """Return a frozen event VAE after a short training with some settings of the model changed.
 
-    The same seed gives the same windows, whatever is changed. A training that was finished
-    before is read from the run folder.
+    The same seed gives the same windows, whatever is changed. A finished training is read from the
+    run folder.
     """
     config = folder.config
     settings = trial_settings(config, changes)
@@ -34,13 +34,13 @@ def trained(folder: Run, changes: Mapping[str, Any], seed: int) -> EventVAE:
 
 
 def trial_settings(config: Config, changes: Mapping[str, Any]) -> EvaeSettings:
-    """The settings of the run's event VAE with some of them changed."""
+    """Return the settings of the run's event VAE with some of them changed."""
     changed: EvaeSettings = dataclasses.replace(evae_settings(config), **changes)
     return changed
 
 
 def kept(folder: Run, file: Path, settings: EvaeSettings, seed: int, iterations: int) -> EventVAE:
-    """The frozen event VAE of a file, trained briefly on the run's recordings if it is not there yet."""
+    """Return the frozen event VAE of a file; if it is missing, train it briefly on the run's recordings."""
     config = folder.config
     if not file.with_suffix(".json").exists():
         train = read_recording(data_file(folder, "train"))
@@ -53,7 +53,7 @@ def kept(folder: Run, file: Path, settings: EvaeSettings, seed: int, iterations:
 def train_short(
     config: Config, train: Recording, settings: EvaeSettings, seed: int, iterations: int, title: str
 ) -> EventVAE:
-    """Train for some iterations as `jobs.training.pretrain` does, without its checkpoints."""
+    """Return a frozen event VAE trained as in `jobs.training.pretrain`, without checkpoints."""
     training = EvaeTraining(settings, train, config.pretrain, (seed, 3))
     with progress(title, iterations, "iterations") as advance:
         for iteration in range(iterations):

@@ -2,22 +2,22 @@
 
 A pixel fires when its response to light (by default the logarithm) has moved by the contrast
 threshold from the level that it remembers (appendix E.1, read so that equations 5 to 8 are
-well founded). What it remembers is the setting `memory`:
+well defined). The setting `memory` selects this level:
 
 - "reference": the level moves only by whole thresholds, as in a real sensor, so events do not
-  depend on how often one looks; it is kept as a first level and counts, so it does not drift.
-- "frame": the level is the previous frame's, as the paper has it; what stays below the
-  threshold is forgotten.
-- "legacy": the published code of the paper (microsoft/event-vae-rl, event_sim.py). Of the
-  whole thresholds within the difference of two frames it loses the first, so a step of less
-  than two makes no event; the others are stamped from the start of the interval on, event k
+  depend on the frame rate. It is stored as a first level and counts, so it does not drift.
+- "frame": the level is the response at the previous frame, as in the paper; changes below the
+  threshold are forgotten.
+- "legacy": the published code of the paper (microsoft/event-vae-rl, event_sim.py). It loses the
+  first of the whole thresholds within the difference of two frames, so a step of less than two
+  thresholds gives no event. The others are stamped from the start of the interval on, event k
   of n at t_last + k (t - t_last) / n. To match it set `max_events_per_pixel=10` and
-  `luminance_floor=0.001 / 255`. Two things are not as published: the first event, which it
-  stamps t_last, is stamped t_last + 1 us, since that time belongs to the frame before; and
-  microseconds are not added to nanoseconds.
+  `luminance_floor=0.001 / 255`. Two things differ from the published code: the first event gets
+  the time t_last + 1 us instead of t_last, which belongs to the frame before; and microseconds
+  are not added to nanoseconds.
 
-Frames between those of the control steps make the events of "reference" better. "frame" and
-"legacy" compare one frame with the next and forget, so each more frame costs them events:
+Frames between control steps make the events of "reference" more accurate. "frame" and "legacy"
+compare each frame with the one before and forget the rest, so more frames cost them events:
 give them one frame per control step.
 """
 
@@ -37,16 +37,16 @@ from envs.events.photoreceptor import Curve, encode, encoding_tables, response_c
 __all__ = ["EVENT", "EventCamera"]
 
 LUMINANCE = np.dtype(np.float32)
-T_LIMIT_US = 2**52  # exact in float64, 142 years
+T_LIMIT_US = 2**52  # 142 years; exact in float64
 MIN_THRESHOLD_SHARE = 0.1  # of the nominal threshold, under mismatch
 MIN_THRESHOLD = 1e-6
 
 
 def pixel_thresholds(config: CameraConfig) -> tuple[np.ndarray, np.ndarray]:
-    """ON and OFF thresholds, float64 (H * W,) each, or (1,) without mismatch.
+    """Return the ON and OFF thresholds, float64 (H * W,) each, or (1,) without mismatch.
 
-    Under mismatch they are normal around the nominal threshold, ON and OFF independent, drawn
-    from `threshold_seed`, and never below a tenth of the nominal nor below 1e-6.
+    With mismatch they are drawn from `threshold_seed`, normally distributed around the nominal threshold,
+    independent for ON and OFF, and never below a tenth of the nominal threshold nor below 1e-6.
     """
     on = config.contrast_threshold
     off = on if config.contrast_threshold_off is None else config.contrast_threshold_off
@@ -62,19 +62,19 @@ def pixel_thresholds(config: CameraConfig) -> tuple[np.ndarray, np.ndarray]:
 class EventCamera:
     """One event camera with its per-pixel memory.
 
-    Same frames, same times and same settings give the same bytes, on any machine: what
-    decides an event is computed without a library's logarithm.
+    The same frames, times and settings give the same bytes on any machine, because the
+    computation does not use a library's logarithm.
 
     Attributes:
         config: The settings, `CameraConfig`.
-        dropped: Events lost in the last step, to `max_events_per_pixel` or because a frame
-            gives at most `MAX_EVENTS_PER_FRAME`, the earliest ones. With excess "carry" they
-            are not lost but fire in later frames, and the number is 0.
+        dropped: Number of events lost in the last step, because a pixel exceeded
+            `max_events_per_pixel` or the frame `MAX_EVENTS_PER_FRAME`; the earliest events stay.
+            With excess "carry" the excess fires in later frames instead, and `dropped` is 0.
         t_us: Time of the last frame [us].
     """
 
     def __init__(self, width: int | CameraConfig = 64, height: int = 64, **fields: Any) -> None:
-        """Make a camera from sizes and fields, or from a `CameraConfig` and fields to replace.
+        """Create a camera from sizes and fields, or from a `CameraConfig` and fields to replace.
 
         Raises:
             ValueError: A setting is unknown, of the wrong type or out of range.
@@ -106,7 +106,7 @@ class EventCamera:
 
     @property
     def state(self) -> tuple[Any, Any, Any]:
-        """Model, memory and scratch, as the kernels take them."""
+        """Model, memory and scratch, in the form that the kernels take."""
         return self._model, self._memory, self._scratch
 
     @property
@@ -115,14 +115,14 @@ class EventCamera:
         return np.arange(self.config.width * self.config.height)
 
     def reset(self, luminance: np.ndarray, t_us: int) -> None:
-        """Remember a first frame; it makes no events, and no pixel is in its refractory period.
+        """Remember a first frame; it gives no events, and no pixel is in its refractory period.
 
         Args:
             luminance: float32 (H, W), linear, finite, >= 0; 1 is white.
-            t_us: Its time [us].
+            t_us: Time of the frame [us].
 
         Raises:
-            ValueError: Wrong shape, dtype, value or time; the camera is unchanged.
+            ValueError: Wrong shape, dtype, value or time; the camera stays unchanged.
         """
         flat, t_us = self._checked(_stacked(luminance), 1), checked_time(t_us)
         bad = int(crossings.first_invalid(flat[0]))
@@ -141,14 +141,14 @@ class EventCamera:
 
         Args:
             luminance: float32 (H, W), linear, finite, >= 0; 1 is white. It is copied.
-            t_us: Its time [us], later than the last frame's.
+            t_us: Time of the frame [us], later than the last frame's.
 
         Returns:
             EVENT array with t in (t_last, t_us], sorted by (t, y, x, order in the pixel).
 
         Raises:
-            ValueError: No reset yet, or wrong shape, dtype, value or time; the camera is
-                unchanged and takes the next good frame.
+            ValueError: No reset yet, or wrong shape, dtype, value or time; the camera stays
+                unchanged and accepts the next valid frame.
         """
         return self.steps(_stacked(luminance), (t_us,))
 
@@ -156,15 +156,15 @@ class EventCamera:
         """Return the events of several successive frames in one call.
 
         Args:
-            frames: float32 (K, H, W), K >= 1, each as `step` takes it.
-            times_us: Their times [us], each later than the one before.
+            frames: float32 (K, H, W), K >= 1, each as for `step`.
+            times_us: Times of the frames [us], increasing.
 
         Returns:
             EVENT array with t in (t_last, times_us[-1]], sorted; the same bytes as K calls of
-            `step`. `dropped` counts the events lost in all K.
+            `step`. `dropped` counts the events lost in all K frames.
 
         Raises:
-            ValueError: As `step`; if one frame or time is refused, none is taken.
+            ValueError: As for `step`; if one frame or time is invalid, the camera stays unchanged.
         """
         if self.t_us is None:
             raise ValueError("EventCamera.step needs a first frame; call reset(luminance, t_us) before it.")
@@ -191,7 +191,7 @@ class EventCamera:
         return events
 
     def _encoded(self, flat: np.ndarray) -> np.ndarray:
-        """Return the frames (K, N) after an 8-bit front end."""
+        """Return the frames (K, N) after the 8-bit encoding."""
         assert self._tables is not None  # noqa: S101  for the type checker
         encoded = np.empty_like(flat)
         bad = int(encode(flat.ravel(), *self._tables, encoded.ravel()))
@@ -200,7 +200,7 @@ class EventCamera:
         return encoded
 
     def _filtered(self, seen: np.ndarray, times_us: np.ndarray) -> np.ndarray:
-        """Return the frames (K, N) after the bandwidth of the photoreceptors."""
+        """Return the frames (K, N) after the low-pass filter of the photoreceptors."""
         bad = int(crossings.first_invalid(seen.ravel()))
         if bad >= 0:
             raise self._invalid(seen, bad)
@@ -223,7 +223,7 @@ class EventCamera:
 
 
 def _stacked(luminance: np.ndarray) -> np.ndarray:
-    """Return one frame as a stack of one; what is no array stays unchanged, and is refused later."""
+    """Return one frame as a stack of one; anything but an array is returned unchanged and raises later."""
     return luminance[None] if isinstance(luminance, np.ndarray) else luminance
 
 

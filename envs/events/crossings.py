@@ -1,18 +1,18 @@
 """The event camera's kernels: which pixels crossed which levels between two frames, and when.
 
 A pixel whose luminance stays within its quiet band cannot fire, and costs few operations. The band is
-computed in float32 from the light that the remembered level stands for: a share of that light up and
-down, narrower than exact by more than all rounding. Where each pixel has thresholds or noise of its own, both
-ends of its band are kept instead. It lies inside [0, largest float32], so anything that is not a luminance
-falls outside it as well. Pixels outside their band are decided in float64, in blocks, so that their
-logarithms are computed in wide instructions.
+computed in float32 as a share, up and down, of the light that belongs to the remembered level. It is narrower
+than the exact band by more than all rounding errors. If each pixel has its own thresholds or noise, both ends
+of its band are stored instead. The band lies inside [0, largest float32], so a value that is not a luminance
+is outside it too. Pixels outside their band are decided in float64, in blocks, so that their logarithms are
+computed in wide instructions.
 
-So a frame reads and writes 8 bytes of each pixel (12 where bands are kept), and 16 more of those outside
-their band.
+A frame therefore reads and writes 8 bytes of each pixel (12 if bands are stored), and 16 more of each pixel
+outside its band.
 
-`EventCamera` hands over `model` and `memory` as plain tuples of few arrays, which numba reads faster
-than named ones; `steps` and `remember` name them. Input is valid, except that `steps` and `first_invalid`
-look for values that are not luminances.
+`EventCamera` passes `model` and `memory` as plain tuples of few arrays, which numba reads faster than named
+tuples; `steps` and `remember` name them. Input is assumed valid, except that `steps` and `first_invalid` look
+for values that are not luminances.
 """
 
 from enum import IntEnum
@@ -35,25 +35,25 @@ from envs.events.refractory import (
 MARGIN = 1e-9  # relative; far above the error of float64 exp
 HALF_ULP = 2.0**-23  # relative; above the rounding of a bound to float32
 BAND_MARGIN = 2.0**-21  # relative; above the rounding of a band that is computed in float32
-MOST_QUIET = 80.0  # a change of the response, by which the light still has a factor in float32
-LEAST_LIGHT = 1e-30  # of a remembered level; below it float32 would round more coarsely
-NEVER_QUIET = np.float32(-np.inf)  # the light of a level whose pixel is decided in every frame
-MOST_CROSSINGS = 2**30  # one frame adds fewer than 2**27: that many of the smallest thresholds is all light
+MOST_QUIET = 80.0  # change of the response whose factor on the light still fits float32
+LEAST_LIGHT = 1e-30  # light of a remembered level below which float32 rounds more coarsely
+NEVER_QUIET = np.float32(-np.inf)  # light of a level whose pixel is decided in every frame
+MOST_CROSSINGS = 2**30  # one frame adds fewer than 2**27, the whole range of light in smallest thresholds
 BLOCK = 1024  # pixels decided together
 
-# What is remembered of a level, read and written only where a pixel is outside its quiet band.
+# The remembered level, read and written only if a pixel is outside its quiet band.
 LEVEL = np.dtype([("first_level", "f8"), ("on_count", "i4"), ("off_count", "i4")])
 
 
 class Rule(NamedTuple):
-    """How a pixel fires.
+    """Rule by which a pixel fires.
 
     Attributes:
         refractory_us: Refractory period after an event [us]; 0: none.
-        max_events: Most events of one pixel in one frame.
-        carries: Events beyond the most fire in later frames; otherwise they are lost.
-        forgets: The remembered level is the last frame's.
-        legacy: Events are counted and timed as in the paper's published code.
+        max_events: Largest number of events of one pixel in one frame.
+        carries: Whether events beyond `max_events` fire in later frames; otherwise they are lost.
+        forgets: Whether the remembered level is the response at the last frame.
+        legacy: Whether events are counted and timed as in the paper's published code.
     """
 
     refractory_us: int
@@ -64,13 +64,13 @@ class Rule(NamedTuple):
 
 
 class Thresholds(NamedTuple):
-    """Thresholds of all pixels, float64 (N,), or of one that stands for all, (1,).
+    """Thresholds of each pixel, float64 (N,), or one for all pixels, (1,).
 
     Attributes:
         on, off: Change of the response that fires an event.
-        quiet_up, quiet_down: Change up to which a pixel cannot fire, rounding allowed for.
-        share_up, share_down: The like change of light, as a share of the light of the level, or of the knee
-            if that is more; less than exact by more than the rounding of a band in float32.
+        quiet_up, quiet_down: Change of the response up to which a pixel cannot fire, less a rounding margin.
+        share_up, share_down: The corresponding change of light, as a share of the level's light or of the
+            knee, whichever is more; less than exact by more than the rounding of a band in float32.
     """
 
     on: np.ndarray
@@ -82,7 +82,7 @@ class Thresholds(NamedTuple):
 
 
 class Model(NamedTuple):
-    """What all pixels have in common, fixed for a camera."""
+    """The properties that all pixels share, fixed for a camera."""
 
     rule: Rule
     curve: Curve
@@ -90,20 +90,20 @@ class Model(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """What the N pixels remember; changed in place.
+    """Memory of the N pixels; changed in place.
 
-    The remembered level is `first_level` + `on_count` thresholds - `off_count` thresholds: a
-    count, unlike a sum, does not drift. After 2**30 crossings of one pixel (at one each microsecond,
-    18 minutes) `count_crossings` begins again with a first level that is rounded once.
+    The remembered level is `first_level` + `on_count` ON thresholds - `off_count` OFF thresholds. Counts,
+    unlike a sum, do not drift. After 2**30 crossings of one pixel (18 minutes at one per microsecond)
+    `count_crossings` starts again with a first level that has been rounded once.
 
     Attributes:
         previous: Last frame, float32.
         level_light: Light of the remembered level, plus the curve's shift, float32; -inf: never quiet.
-        quiet_low, quiet_high: Quiet band of luminance, both ends included, float32; set where `is_banded`.
+        quiet_low, quiet_high: Quiet band of luminance, both ends included, float32; set if `is_banded`.
         first_level: Response at the first frame, or after the last refractory period, float64.
-        on_count, off_count: Thresholds crossed since, int32.
-        refractory_end_us: End of the last refractory period, int64; of length 0 without any.
-        is_banded: Whether both ends of the bands are kept instead of `level_light`, bool (1,).
+        on_count, off_count: Number of thresholds crossed since `first_level`, int32.
+        refractory_end_us: End of the last refractory period [us], int64; (0,) without refractory periods.
+        is_banded: Whether both ends of the bands are stored instead of `level_light`, bool (1,).
     """
 
     previous: np.ndarray
@@ -118,7 +118,7 @@ class Memory(NamedTuple):
 
 
 class Room(NamedTuple):
-    """Room for a block of pixels, (BLOCK,) each: float64, but `exponents` int64 and `lights` float32."""
+    """Room for a block of pixels, (BLOCK,) each: float64, except `exponents` int64 and `lights` float32."""
 
     before: np.ndarray
     after: np.ndarray
@@ -130,9 +130,9 @@ class Room(NamedTuple):
 
 
 class Column(IntEnum):
-    """Where each column begins in the table of a block, float64 (8 * BLOCK,).
+    """Start of each column in the table of a block, float64 (8 * BLOCK,).
 
-    One flat array with constant distances, because LLVM then knows that the columns do not
+    The table is one flat array with constant distances. LLVM then knows that the columns do not
     overlap, and compiles the loops over them to wide instructions.
     """
 
@@ -141,22 +141,22 @@ class Column(IntEnum):
     REMEMBERED = 2 * BLOCK  # remembered level
     ON = 3 * BLOCK  # threshold
     OFF = 4 * BLOCK  # threshold
-    COUNT = 5 * BLOCK  # levels crossed, negative if downwards
+    COUNT = 5 * BLOCK  # number of levels crossed, negative if downwards
     START = 6 * BLOCK  # time of the first event after the last frame [us]
     STRIDE = 7 * BLOCK  # time from one event to the next [us]
 
 
 def threshold_rows(on: np.ndarray, off: np.ndarray, reach: int, curve: Curve) -> np.ndarray:
-    """Rows of `Thresholds`, float64 (6, N) or (6, 1).
+    """Return the rows of `Thresholds`, float64 (6, N) or (6, 1).
 
-    By a change d of the response the light of the curve "log" gets exp(d) times as much. "lin_log" is, above
-    a light y, nowhere steeper than 1 / max(y, knee); below y, it is above the logarithm and its slope at
-    most 1 / knee.
+    With the curve "log", a change d of the response multiplies the light by exp(d). The curve "lin_log" is
+    nowhere steeper than 1 / max(y, knee) above a light y; below y, it lies above the logarithm and its slope
+    is at most 1 / knee.
 
     Args:
         on: ON thresholds, float64 (N,) or (1,).
-        off: OFF thresholds, as many.
-        reach: Thresholds to the first event: 1, or 2 where the first is lost ("legacy").
+        off: OFF thresholds, of the same shape.
+        reach: Number of thresholds to the first event: 1, or 2 if the first is lost ("legacy").
         curve: Response curve.
     """
     up, down = reach * on - TOLERANCE - MARGIN, reach * off - TOLERANCE - MARGIN
@@ -166,14 +166,14 @@ def threshold_rows(on: np.ndarray, off: np.ndarray, reach: int, curve: Curve) ->
 
 
 def memory_rows(num_pixels: int, has_refractory_period: bool) -> tuple[np.ndarray, ...]:
-    """Rows of a `Memory`, to be set by `remember`: float32 (4, N), LEVEL (N,), and the last two."""
+    """Allocate the arrays of a `Memory`, which `remember` sets: float32 (4, N), LEVEL (N,), the last two."""
     ends = np.zeros(num_pixels if has_refractory_period else 0, np.int64)
     return np.zeros((4, num_pixels), np.float32), np.zeros(num_pixels, LEVEL), ends, np.zeros(1, np.bool_)
 
 
 @numba.njit(cache=True, error_model="numpy")
 def make_room():
-    """Room for the blocks of one step."""
+    """Allocate room for the blocks of one step."""
     rows = np.empty((5, BLOCK))
     numbers, lights = np.empty(BLOCK, np.int64), np.empty(BLOCK, np.float32)
     return Room(rows[0], rows[1], rows[2], rows[3], rows[4], numbers, lights)
@@ -181,7 +181,7 @@ def make_room():
 
 @numba.njit(cache=True, error_model="numpy", inline="always")
 def named(model, memory):
-    """Return the model and the memory, with names."""
+    """Return the model and the memory as named tuples."""
     rule, curve, limits = model
     lights, levels, ends, is_banded = memory
     thresholds = Thresholds(limits[0], limits[1], limits[2], limits[3], limits[4], limits[5])
@@ -195,9 +195,9 @@ def named(model, memory):
 
 @numba.njit(cache=True, error_model="numpy")
 def first_invalid(luminance):
-    """Index of the first value that is not finite and >= 0, or -1."""
+    """Return the index of the first value that is not finite and >= 0, or -1."""
     valid = True
-    for i in range(luminance.size):  # without a branch: it compiles to wide instructions
+    for i in range(luminance.size):  # no branch, so that it compiles to wide instructions
         valid &= (luminance[i] >= 0.0) & (luminance[i] <= MAX_LUMINANCE)
     if valid:
         return -1
@@ -221,7 +221,7 @@ def remember(luminance, model, memory):
 
 @numba.njit(cache=True, error_model="numpy")
 def _remember_levels(luminance, model, memory):
-    """Take the responses of all pixels as their first levels, and set the quiet bands around them."""
+    """Set the first levels of all pixels to their responses, and the quiet bands around these levels."""
     room = make_room()
     for first in range(0, luminance.size, BLOCK):
         pixels = np.arange(first, min(first + BLOCK, luminance.size))
@@ -234,7 +234,7 @@ def _remember_levels(luminance, model, memory):
 
 @kernel
 def set_quiet_bands(pixels, levels, model, memory, room):
-    """Quiet bands of at most BLOCK `pixels` that remember `levels`."""
+    """Set the quiet bands of at most BLOCK `pixels` that remember `levels`."""
     low, high, thresholds = room.low[: pixels.size], room.high[: pixels.size], model.thresholds
     if not memory.is_banded[0]:
         _set_level_lights(pixels, levels, model.curve, memory, room)
@@ -251,13 +251,13 @@ def set_quiet_bands(pixels, levels, model, memory, room):
 
 @inlined
 def _bound(value, inwards):
-    """Return a bound of the quiet band as float32, never further out than `value` and never invalid."""
+    """Return a bound of the quiet band as float32: never farther out than `value`, never invalid."""
     return np.float32(min(max(value * inwards, 0.0), MAX_LUMINANCE))
 
 
 @inlined
 def _set_level_lights(pixels, levels, curve, memory, room):
-    """Keep the lights that pixels respond to by `levels`, from which their bands are computed."""
+    """Store the lights that belong to `levels`; `scan` computes the quiet bands from them."""
     lights = room.low[: pixels.size]
     for j in range(pixels.size):
         lights[j] = levels[j]
@@ -270,16 +270,16 @@ def _set_level_lights(pixels, levels, curve, memory, room):
 
 @numba.njit(cache=True, error_model="numpy")
 def steps(frames, times_us, width, limit, model, memory, scratch):
-    """Compute the events of several successive frames; nothing changes if a value is no luminance.
+    """Compute the events of several successive frames; nothing changes if a value is not a luminance.
 
     Args:
         frames: float32 (K, N).
-        times_us: int64 (K + 1,), of the frame before them and theirs, increasing [us].
+        times_us: int64 (K + 1,), times of the previous frame and of these frames, increasing [us].
         width: Pixels of a row.
-        limit: Most events of one frame, of all pixels together.
-        model: Values of a `Model`: those of `Rule`, those of `Curve`, and `threshold_rows`.
-        memory: As `memory_rows`.
-        scratch: One flag a pixel, uint64 (ceil(N / 8),), and room for pixels, int64 (8 ceil(N / 8),).
+        limit: Largest number of events in one frame, all pixels together.
+        model: Values of a `Model`: the fields of `Rule`, the fields of `Curve`, and `threshold_rows`.
+        memory: From `memory_rows`.
+        scratch: One flag per pixel, uint64 (ceil(N / 8),), and room for pixels, int64 (8 ceil(N / 8),).
 
     Returns:
         Index of the first invalid value in the flat frames, or -1; the number of events lost;
@@ -308,7 +308,7 @@ def steps(frames, times_us, width, limit, model, memory, scratch):
 
 @numba.njit(cache=True, error_model="numpy")
 def _step(luminance, span, width, limit, model, memory, scratch):
-    """Compute one frame: (first invalid pixel or -1, events lost, events)."""
+    """Compute the events of one frame; return first invalid pixel or -1, number of events lost, events."""
     flags, outside = scratch
     found = scan(luminance, 0, model, memory, flags, outside)
     counts, times = np.empty((2, found), np.int64), np.empty((2, found))
@@ -332,7 +332,7 @@ def _step(luminance, span, width, limit, model, memory, scratch):
 
 @kernel
 def scan(luminance, begin, model, memory, flags, outside):
-    """Write the pixels outside their quiet band, from pixel `begin` on, in their order; return how many.
+    """Write the pixels outside their quiet band, from pixel `begin` on, in order; return their number.
 
     The loops over pixels have no branch, so that they compile to wide instructions.
     """
@@ -354,15 +354,15 @@ def scan(luminance, begin, model, memory, flags, outside):
 
 @inlined
 def write_flagged(flags, size, begin, places):
-    """Write `begin` + i for each i < `size` whose flag is set, in their order; return how many.
+    """Write `begin` + i for each i < `size` whose flag is set, in order; return the number written.
 
-    Eight flags are looked at together: most are not set.
+    Eight flags are tested together, because most are not set.
 
     Args:
-        flags: One a byte, uint64 (ceil(size / 8),) or more; changed from `size` on.
-        size: How many.
-        begin: Added to each.
-        places: Room for eight times as many words, int64.
+        flags: One flag per byte, uint64 (ceil(size / 8),) or more; cleared from flag `size` on.
+        size: Number of flags.
+        begin: Offset of the written numbers.
+        places: Filled with the numbers, int64, room for eight per word of `flags`.
     """
     flag, found, words = flags.view(np.uint8), 0, (size + 7) // 8
     for i in range(size, 8 * words):
@@ -377,10 +377,10 @@ def write_flagged(flags, size, begin, places):
 
 @numba.njit(cache=True, error_model="numpy")
 def _decide(luminance, span, model, memory, trains, motions):
-    """Keep, of the pixels outside their band, those that fire or end a refractory period.
+    """Find which of the pixels outside their band fire or end a refractory period, and write their trains.
 
     Returns:
-        First invalid pixel or -1, and the number of trains kept.
+        First invalid pixel or -1, and the number of trains.
     """
     table, room, kept = np.empty(8 * BLOCK), make_room(), 0
     for first in range(0, trains.crossings.size, BLOCK):
@@ -400,7 +400,7 @@ def _decide(luminance, span, model, memory, trains, motions):
 
 @kernel
 def respond_at(pixels, luminance, curve, levels, room):
-    """Write the responses to the luminance of `pixels`; the first pixel with an invalid one, or -1."""
+    """Write the responses of `pixels`; return the first pixel with an invalid luminance, or -1."""
     lights = room.lights
     for j in range(pixels.size):
         lights[j] = luminance[pixels[j]]
@@ -412,7 +412,7 @@ def respond_at(pixels, luminance, curve, levels, room):
 
 @numba.njit(cache=True, error_model="numpy")
 def _recall(pixels, model, memory, table):
-    """Fill in the block's thresholds and remembered levels."""
+    """Write the block's thresholds and remembered levels into the table."""
     thresholds = model.thresholds
     for j in range(pixels.size):
         k = pixels[j] if thresholds.on.size > 1 else 0
@@ -424,7 +424,7 @@ def _recall(pixels, model, memory, table):
 
 @inlined
 def level_of(memory, i, on, off):
-    """Remembered level; equal thresholds multiply the exact net count once."""
+    """Return the remembered level; equal thresholds multiply the exact net count, which rounds only once."""
     if on == off:
         return memory.first_level[i] + (memory.on_count[i] - memory.off_count[i]) * on
     return memory.first_level[i] + memory.on_count[i] * on - memory.off_count[i] * off
@@ -432,23 +432,23 @@ def level_of(memory, i, on, off):
 
 @inlined
 def count_crossings(memory, i, crossed, rises, on, off):
-    """Count thresholds that a pixel crossed; the level from which it looks on."""
+    """Count thresholds that a pixel crossed; return the new remembered level."""
     if rises:
         memory.on_count[i] += crossed
     else:
         memory.off_count[i] += crossed
     level = level_of(memory, i, on, off)
-    if max(memory.on_count[i], memory.off_count[i]) > MOST_CROSSINGS:  # they must not wrap
+    if max(memory.on_count[i], memory.off_count[i]) > MOST_CROSSINGS:  # the counts must not overflow
         memory.first_level[i], memory.on_count[i], memory.off_count[i] = level, 0, 0
     return level
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _compare(size, span, rule, table):
-    """Fill in the block's counts, starts and strides, without branches.
+    """Compute the block's counts, starts and strides, without branches.
 
-    A still pixel fires only what it carries over. A level reached before this frame is due at
-    once: its pixel may by now move the other way, which gives pace 0.
+    A still pixel fires only events carried over. A level that was reached before this frame is due at
+    once; if its pixel now moves in the other direction, the pace is 0.
     """
     interval = span.end_us - span.start_us
     for j in range(size):
@@ -466,7 +466,7 @@ def _compare(size, span, rule, table):
 
 @numba.njit(cache=True, error_model="numpy")
 def _keep(pixels, span, rule, table, trains, kept):
-    """Append the trains of the pixels that fire; return how many trains there are now."""
+    """Append the trains of the pixels that fire; return the new number of trains."""
     for j in range(pixels.size):
         count = table[Column.COUNT + j]
         trains.pixels[kept], trains.crossings[kept] = pixels[j], int(count)
@@ -480,7 +480,7 @@ def _keep(pixels, span, rule, table, trains, kept):
 
 @numba.njit(cache=True, error_model="numpy")
 def _keep_refractory(pixels, span, rule, memory, table, trains, motions, kept):
-    """Append the trains of the pixels that fire or end a refractory period; return how many there are."""
+    """Append the trains of pixels that fire or end a refractory period; return the new number of trains."""
     for j in range(pixels.size):
         i = pixels[j]
         end_us = memory.refractory_end_us[i]
@@ -500,7 +500,7 @@ def _keep_refractory(pixels, span, rule, memory, table, trains, motions, kept):
 
 @numba.njit(cache=True, error_model="numpy")
 def _advance(luminance, span, model, memory, trains, motions):
-    """Move remembered levels and quiet bands of pixels that fired or ended a refractory period."""
+    """Update remembered levels and quiet bands of pixels that fired or ended a refractory period."""
     rule, thresholds, pixels = model.rule, model.thresholds, trains.pixels
     if rule.forgets:
         _remember_levels(luminance, model, memory)

@@ -1,7 +1,7 @@
-"""Events that say something wrong: displaced by a pixel, or of the other polarity.
+"""Wrong events: displaced by a pixel, or of the other polarity.
 
 No sensor makes such errors in these shares. They let a study compare kinds of errors at the same share of
-events that differ (`conf/exp/dose_response.yaml`).
+wrong events (`conf/exp/dose_response.yaml`).
 """
 
 import numpy as np
@@ -14,18 +14,18 @@ NEIGHBOURS = np.array([(dx, dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1) if dx 
 def disturb(
     events: np.ndarray, faults: FaultsConfig, shape: tuple[int, int], rng: np.random.Generator
 ) -> np.ndarray:
-    """Displace a share of the events to one of their 8 neighbours, and turn the polarity of a share.
+    """Displace a share of the events to one of their 8 neighbours, and flip the polarity of a share.
 
-    Each event is drawn on its own. An event that would leave the image goes the opposite way.
+    Each event is drawn independently. An event that would leave the image is displaced the opposite way.
 
     Args:
         events: EVENT sorted by (t, y, x); not changed.
         faults: `displaced` and `flipped`, the shares.
-        shape: (H, W), at least 2 x 2 pixels where events are displaced.
+        shape: (H, W), at least 2 x 2 pixels if events are displaced.
         rng: Source of the draws; a share of 0 draws nothing.
 
     Returns:
-        EVENT sorted by (t, y, x), as many.
+        The same number of EVENT, sorted by (t, y, x).
     """
     if faults.displaced == faults.flipped == 0.0:
         return events

@@ -1,4 +1,4 @@
-"""From trains to events: the events of one pixel between two frames lie evenly in time."""
+"""From trains to events: the events of one pixel between two frames are evenly spaced in time."""
 
 from typing import NamedTuple
 
@@ -6,9 +6,9 @@ import numba
 import numpy as np
 
 EVENT = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "i1")])
-# Every pixel of the largest sensor can fire once; 0.6 GB at the most while they are sorted.
+# Every pixel of the largest sensor can fire once; sorting takes at most 0.6 GB.
 MAX_EVENTS_PER_FRAME = 2**24
-MIN_BITS, MAX_BITS = 6, 13  # of a sort's digit; 13 take a table of 64 KiB
+MIN_BITS, MAX_BITS = 6, 13  # of a digit in the sort; 13 bits need a table of 64 KiB
 
 
 class Span(NamedTuple):
@@ -25,10 +25,10 @@ class Trains(NamedTuple):
     rounded to a whole microsecond in [1, interval].
 
     Attributes:
-        pixels: Flat indices in increasing order, int64.
-        crossings: Levels crossed, negative if downwards, int64.
-        sent: How many of them become events, int64.
-        start, stride: Time of the first event, and from one to the next [us], float64.
+        pixels: Flat indices of the pixels in increasing order, int64.
+        crossings: Number of levels crossed, negative if downwards, int64.
+        sent: Number of crossings that become events, int64.
+        start, stride: Time of the first event, and time from one event to the next [us], float64.
     """
 
     pixels: np.ndarray
@@ -40,15 +40,15 @@ class Trains(NamedTuple):
 
 @numba.njit(cache=True, error_model="numpy", inline="always")
 def moment(start, stride, k, interval):
-    """When event `k` of a train comes [us after the last frame]."""
+    """Return the time of event `k` of a train [us after the last frame]."""
     return np.int64(min(max(np.rint(start + k * stride), 1.0), interval))
 
 
 @numba.njit(cache=True, error_model="numpy")
 def limit_events(trains, span, limit):
-    """Lower `trains.sent` so that at most `limit` events remain, the earliest ones; return how many.
+    """Lower `trains.sent` so that at most `limit` events remain, the earliest; return their number.
 
-    If the first microsecond alone holds more, all trains keep the same number of events.
+    If the first microsecond alone has more events, all trains keep the same number of events.
     """
     sent, total = trains.sent, trains.sent.sum()
     if total <= limit:
@@ -91,9 +91,9 @@ def _train_until(trains, j, t, interval):
 
 @numba.njit(cache=True, error_model="numpy")
 def events_of(trains, span, width, total):
-    """EVENT array of all trains, sorted by (t, y, x, order in the pixel). O(events) for any interval.
+    """Return the EVENT array of all trains, sorted by (t, y, x, order in the pixel), in O(events).
 
-    A radix sort by time is stable, so that ties keep the raster order in which the trains come.
+    The radix sort by time is stable, so ties keep the raster order of the trains.
 
     Args:
         trains: `Trains`, of which `total` events are sent.
@@ -108,7 +108,7 @@ def events_of(trains, span, width, total):
 
 @numba.njit(cache=True, error_model="numpy")
 def sorted_events(times, places, span):
-    """EVENT array in the order of time, ties as they are given.
+    """Return the EVENT array in the order of time; ties keep the given order.
 
     Args:
         times: int64 (N,), after the start of the span [us], at most its length.
@@ -156,7 +156,7 @@ def _emitted(trains, interval, width, total):
 
 @numba.njit(cache=True, error_model="numpy")
 def _digits(interval, total):
-    """Choose passes and bits per pass of the sort: few events do not pay for a large table."""
+    """Choose passes and bits per pass of the sort; a large table does not pay for few events."""
     needed = 1
     while interval >> needed > 0:
         needed += 1
@@ -169,7 +169,7 @@ def _digits(interval, total):
 
 @numba.njit(cache=True, error_model="numpy")
 def _starts(times, shift, mask, largest):
-    """Return where the events of each digit, at most `largest`, start in the order of that digit."""
+    """Return the start index of each digit's events, in the order of that digit; digits are <= `largest`."""
     starts = np.zeros(largest + 2, np.int64)
     for t in times:
         starts[((t >> shift) & mask) + 1] += 1

@@ -1,16 +1,16 @@
 """Faults of a real sensor: dead and hot pixels, lost events, events without cause (appendix D.3).
 
-`draw_pixel_faults` draws the faulty pixels of an episode, `apply_faults` applies their faults to the events
-of one interval; `RealSensor` adds what acts on the pixels themselves, and what happens between them and the
-reader. What is off costs nothing and draws nothing.
+`draw_pixel_faults` draws the faulty pixels of an episode, `apply_faults` applies the faults to the events of
+one interval. `RealSensor` adds the noise of the pixels themselves and the readout. Faults that are off cost
+nothing and draw nothing.
 
-Where nothing but the pixels' noise, lost and false events is asked for, the compiled step of `envs.vehicles`
-applies all of it by `spoil`; the rest needs Python after each step.
+If only pixel noise, lost and false events are on, the compiled step of `envs.vehicles` applies all faults by
+`spoil`; the other faults need Python after each step.
 
 A plug-in adds a fault by `ADDED_FAULTS[name] = make`. At the start of an episode `make(amount, shape, rng)`
-is called, with the amount of `faults.added.NAME`, the image's (H, W) and the episode's random stream. It
-returns `apply(events, t0_us, t1_us)`, which is called after the faults of this file and before the readout,
-with EVENT of the interval (t0_us, t1_us], and returns what they become: EVENT, sorted by t.
+is called with the amount in `faults.added.NAME`, the image's (H, W) and the episode's random stream. It
+returns `apply(events, t0_us, t1_us)`. This is called after the faults of this file and before the readout,
+with the EVENT array of the interval (t0_us, t1_us], and returns the changed EVENT array, sorted by t.
 """
 
 import dataclasses
@@ -34,12 +34,12 @@ NO_BURSTS, NOTHING_FIRED = np.zeros((0, 2), np.int64), np.zeros((3, 0), np.int64
 
 @dataclasses.dataclass(frozen=True)
 class PixelFaults:
-    """The pixels' faults of one episode.
+    """The faulty pixels of one episode.
 
     Attributes:
-        dead: bool (H, W), scattered ones and the block; these never fire, not even noise.
-        live: int64 (L,), flat indices of the others.
-        hot: int64 (K,), flat indices of the hot ones among these.
+        dead: bool (H, W), dead pixels, scattered or in the block; they never fire, not even noise.
+        live: int64 (L,), flat indices of the other pixels.
+        hot: int64 (K,), flat indices of the hot pixels among these.
     """
 
     dead: np.ndarray
@@ -48,7 +48,7 @@ class PixelFaults:
 
 
 class Rates(NamedTuple):
-    """How many events are lost and added, as `FaultsConfig` has them; and whether any pixel may be dead."""
+    """Rates of lost and added events, as in `FaultsConfig`, and whether any pixel may be dead."""
 
     has_dead: bool
     event_dropout: float
@@ -59,15 +59,15 @@ class Rates(NamedTuple):
 
 
 class FaultState(NamedTuple):
-    """The faults of one camera, as compiled code takes them.
+    """The faults of one camera, in the form that compiled code takes.
 
     Attributes:
-        is_on: Whether there are any.
-        noise: Of its pixels, `PixelState`, whose random stream is that of all faults.
-        numbers: The flat pixel y * W + x of each pixel that has noise, int64.
-        dead, live, hot: As `PixelFaults` has them.
+        is_on: Whether there are any faults.
+        noise: Noise of the pixels, `PixelState`; all faults draw from its random stream.
+        numbers: The flat pixel y * W + x of each pixel with noise, int64.
+        dead, live, hot: As in `PixelFaults`.
         rates: `Rates`.
-        expected: float64 (1,), how many false events were to be expected in the last interval.
+        expected: float64 (1,), expected number of false events in the last interval.
     """
 
     is_on: bool
@@ -87,7 +87,7 @@ def fault_state(
     noise: PixelState | None = None,
     numbers: np.ndarray | None = None,
 ) -> FaultState:
-    """Return the faults of one camera for compiled code; `numbers` are those of the pixels of `noise`."""
+    """Return the faults of one camera for compiled code; `numbers` are the flat pixels of `noise`."""
     rates = Rates(
         faults.sparsity > 0.0 or faults.dead_block > 0.0,
         float(faults.event_dropout),
@@ -107,7 +107,7 @@ def draw_pixel_faults(shape: tuple[int, int], faults: FaultsConfig, rng: np.rand
 
     Args:
         shape: (H, W).
-        faults: How many. Numbers of pixels are rounded to the nearest; dead ones are not hot.
+        faults: Shares of dead and hot pixels. Numbers of pixels are rounded; dead pixels are never hot.
         rng: Source of the draws; the same stream gives the same pixels.
     """
     dead = np.zeros(shape, bool)
@@ -134,18 +134,18 @@ NO_FAULTS = _no_faults()
 
 
 class Bursts:
-    """When bursts of false events begin and end: a Poisson process of beginnings, all of one length."""
+    """Times of the bursts of false events: starts are a Poisson process, and all bursts have one length."""
 
     def __init__(self, faults: FaultsConfig, t_us: int, rng: np.random.Generator) -> None:
-        """Begin at a time [us], without a burst; `rng` draws when the next begins."""
+        """Start at time `t_us` [us] without a burst; `rng` draws the time of each next burst."""
         self._pause_us, self._length_us = 1e6 / faults.burst_hz, 1e3 * faults.burst_ms
         self._rng, self._begun_us = rng, list[float]()
         self._next_us = t_us + rng.exponential(self._pause_us)
 
     def until(self, t0_us: int, t1_us: int) -> np.ndarray:
-        """Return the parts (begin, end] of (t0_us, t1_us] that each burst fills, int64 (K, 2).
+        """Return the part (begin, end] of (t0_us, t1_us] covered by each burst, int64 (K, 2).
 
-        They may overlap, as bursts may.
+        The parts may overlap, because bursts may.
         """
         while self._next_us < t1_us:
             self._begun_us.append(self._next_us)
@@ -157,14 +157,14 @@ class Bursts:
 
 
 class RealSensor:
-    """All that a real sensor adds to the events of one camera, from its first frame on.
+    """The faults and the readout that a real sensor adds to one camera, from its first frame on.
 
     Attributes:
         state: `FaultState`.
-        lost: Events of the last interval that the readout lost.
-        is_noise: bool (N,), which events of the last interval no change of the light fired; empty unless
-            asked for. A displaced or flipped event is none; but all that a plug-in returns otherwise than it
-            got it, be it only later, is one.
+        lost: Number of events of the last interval that the readout lost.
+        is_noise: bool (N,), whether each event of the last interval is noise, that is, was not fired by a
+            change of the light; empty unless asked for. A displaced or flipped event is not noise. Events
+            that a plug-in adds or modifies (even only in time) are noise.
     """
 
     def __init__(
@@ -180,12 +180,12 @@ class RealSensor:
         """Draw the faults of a camera that has just seen its first frame.
 
         Args:
-            camera: Its settings.
+            camera: Settings of the camera.
             faults: The faults.
-            state: Its `state`, and the flat pixel y * W + x of each pixel of its memory, int64.
+            state: `state` of the camera, and the flat pixel y * W + x of each pixel of its memory, int64.
             rng: Source of all draws.
-            t_us: The time of that frame [us].
-            labels: Whether `is_noise` is wanted.
+            t_us: The time of the first frame [us].
+            labels: Whether to compute `is_noise`.
 
         Raises:
             ValueError: The pixels are too slow for the rate of shot noise.
@@ -216,15 +216,15 @@ class RealSensor:
 
     @property
     def is_compiled(self) -> bool:
-        """Whether `spoil` applies all of it."""
+        """Whether `spoil` applies all faults."""
         disturbed = self._faults.displaced > 0.0 or self._faults.flipped > 0.0
         later = self._bursts is not None or self._readout is not None or bool(self._added)
         return not (disturbed or later or self._labels)
 
     def events(self, events: np.ndarray, t0_us: int, t1_us: int) -> np.ndarray:
-        """Return the events that leave the sensor in (t0_us, t1_us], given those that the light fired.
+        """Return the events that leave the sensor in (t0_us, t1_us], given the events fired by the light.
 
-        The camera has seen the light of t1_us. As `apply_faults`, which also says what is raised.
+        Call it after the camera has seen the light of t1_us. Raises the same errors as `apply_faults`.
         """
         noise, labels, shape = NOTHING_FIRED, None, self._pixels.dead.shape
         kept = self._noise.kept() if self._noise_labels is not None and self._noise is not None else None
@@ -251,14 +251,14 @@ class RealSensor:
         return events
 
     def _sent(self, events: np.ndarray, t1_us: int) -> np.ndarray:
-        """Return the events that the readout sends until a time [us]."""
+        """Return the events that the readout sends until `t1_us` [us]."""
         assert self._readout is not None  # noqa: S101  for the type checker
         sent, self.lost = self._readout.send(events, t1_us)
         return sent
 
 
 def labelled(events: np.ndarray, is_noise: np.ndarray) -> np.ndarray:
-    """`LABELLED` (N,) of EVENT (N,) and bool (N,)."""
+    """Return events with labels, `LABELLED` (N,), from EVENT (N,) and bool (N,)."""
     rows = np.empty(events.size, LABELLED)
     for name in EVENT.names or ():
         rows[name] = events[name]
@@ -267,14 +267,14 @@ def labelled(events: np.ndarray, is_noise: np.ndarray) -> np.ndarray:
 
 
 def unlabelled(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """EVENT (N,) and bool (N,) of `LABELLED` (N,); events without labels are no noise."""
+    """Return EVENT (N,) and labels, bool (N,), of `LABELLED` (N,); events without labels are not noise."""
     if rows.dtype != LABELLED:
         return rows, np.zeros(rows.size, bool)
     return rows[list(EVENT.names or ())].astype(EVENT), rows["is_noise"].copy()
 
 
 def _check_added(name: str, events: np.ndarray, span_us: tuple[int, int], shape: tuple[int, ...]) -> None:
-    """Raise ValueError if a plug-in's fault returned what is not events of this interval and image."""
+    """Raise ValueError if a plug-in's fault returned anything but events of this interval and image."""
     rule = f"fault {name!r} of {ADDED_FAULTS[name].__module__} must return EVENT"
     if getattr(events, "dtype", None) != EVENT or events.ndim != 1:
         raise ValueError(f"{rule} (N,), got {type(events).__name__} {getattr(events, 'dtype', '')}".strip())
@@ -288,7 +288,7 @@ def _check_added(name: str, events: np.ndarray, span_us: tuple[int, int], shape:
 
 
 def has_readout(camera: CameraConfig) -> bool:
-    """Whether events leave the sensor otherwise than the pixels fire them."""
+    """Whether latency, jitter or a readout limit changes the events that the pixels fire."""
     return camera.latency_us > 0 or camera.latency_jitter_us > 0.0 or camera.readout_hz > 0.0
 
 
@@ -300,29 +300,29 @@ def apply_faults(
     pixels: PixelFaults,
     rng: np.random.Generator,
 ) -> np.ndarray:
-    """Lose true events and add false ones.
+    """Drop true events and add false events.
 
-    Of the true events those of dead pixels are lost, and each other one with probability
-    event_dropout; some are displaced or flipped (`envs.events.disturbances`). To the rest are
-    added, in an interval of T seconds, at uniform times and with uniform polarities:
+    The true events of dead pixels are lost, and each other true event is lost with probability
+    event_dropout. Some are displaced or flipped (`envs.events.disturbances`). False events are
+    added at uniform times and with uniform polarities; their numbers in T seconds are:
 
-    - background_activity: Poisson, this share of the true events left (appendix D.3);
+    - background_activity: Poisson, this share of the remaining true events (appendix D.3);
     - background_activity_hz: Poisson, rate * T per live pixel;
     - hot_pixel_hz: Poisson, rate * T per hot pixel.
 
     Args:
         events: EVENT of the interval, sorted by (t, y, x).
         t0_us: Start of the interval [us].
-        t1_us: Its end [us], later than the start.
-        faults: How much.
-        pixels: Which pixels.
+        t1_us: End of the interval [us], later than the start.
+        faults: Rates of the faults.
+        pixels: The faulty pixels.
         rng: Source of the draws.
 
     Returns:
-        EVENT with t in (t0_us, t1_us], sorted by (t, y, x), true events first where all are equal.
+        EVENT with t in (t0_us, t1_us], sorted by (t, y, x); true events come first in ties.
 
     Raises:
-        ValueError: The interval is empty, or more than 2**24 false events are to be expected.
+        ValueError: The interval is empty, or more than 2**24 false events are expected.
     """
     return _with_faults(events, (t0_us, t1_us), faults, fault_state(faults, pixels, rng), NOTHING_FIRED)[0]
 
@@ -336,10 +336,10 @@ def _with_faults(
     labels: np.ndarray | None = None,
     bursts: np.ndarray = NO_BURSTS,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """`apply_faults`, the events of the pixels' noise and of bursts; and which are noise, bool (N,).
+    """Apply the faults, add the events `fired` by pixel noise and bursts; return events and noise labels.
 
-    All that is added is noise, except where `labels` (bool, one for each event of `fired`) says otherwise; so
-    are those events that come as LABELLED with that label.
+    Added events are noise, except where `labels` (bool, one per event of `fired`) says otherwise. Events that
+    come as LABELLED keep their label.
     """
     t0_us, t1_us = span_us
     if t1_us <= t0_us:
@@ -355,7 +355,7 @@ def _with_faults(
 
 
 def check_expected(state: FaultState, span_us: tuple[int, int]) -> None:
-    """Raise ValueError if more false events were to be expected in an interval than there may be."""
+    """Raise ValueError if the expected number of false events in an interval exceeds the limit."""
     if state.expected[0] > MAX_EVENTS_PER_FRAME:
         raise ValueError(
             f"faults may add {MAX_EVENTS_PER_FRAME} events to an interval; these rates add about "
@@ -368,17 +368,17 @@ def check_expected(state: FaultState, span_us: tuple[int, int]) -> None:
 def spoil(
     events: np.ndarray, span_us: tuple[int, int], model: tuple, memory: tuple, state: FaultState
 ) -> np.ndarray:
-    """Apply the faults of a sensor of which `RealSensor.is_compiled` holds to the events of a step.
+    """Apply a sensor's faults to the events of a step; requires `RealSensor.is_compiled`.
 
     Args:
         events: EVENT that the light fired, sorted by (t, y, x).
-        span_us: When the step began and ended [us].
-        model: Of the camera, as `EventCamera.state` has it.
-        memory: As there; it has seen the light of the end.
+        span_us: Start and end of the step [us].
+        model: Model of the camera, as in `EventCamera.state`.
+        memory: Memory of the camera, after the light of the end of the step.
         state: `FaultState`, changed in place.
 
     Returns:
-        EVENT, sorted; wrong if `state.expected` is more than `MAX_EVENTS_PER_FRAME`.
+        EVENT, sorted; not valid if `state.expected` is more than `MAX_EVENTS_PER_FRAME`.
     """
     rates, fired = state.rates, np.empty((3, 0), np.int64)
     if state.numbers.size > 0:
@@ -391,7 +391,7 @@ def spoil(
 
 @numba.njit(cache=True, error_model="numpy")
 def lose(events: np.ndarray, state: FaultState) -> np.ndarray:
-    """Return the events of live pixels, but each with probability event_dropout not."""
+    """Return the events of live pixels, each dropped with probability event_dropout."""
     rates, rng, dead, count = state.rates, state.noise.rng, state.dead, 0
     kept = np.empty_like(events)
     for i in range(events.size):
@@ -409,17 +409,17 @@ def add_false(
     bursts: np.ndarray,
     state: FaultState,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draw background, hot pixels and bursts, and merge them and the pixels' noise with events.
+    """Draw events of the background, hot pixels and bursts; merge them and the pixels' noise with events.
 
     Args:
-        light: EVENT (N,), sorted by (t, y, x), and which are noise, bool (N,).
-        noise: What `fire` returned, and which of it is noise.
-        span_us: When the interval begins and ends [us].
-        bursts: int64 (K, 2), when each burst begins and ends [us].
+        light: EVENT (N,), sorted by (t, y, x), and whether each is noise, bool (N,).
+        noise: Events from `fire`, and whether each is noise.
+        span_us: Start and end of the interval [us].
+        bursts: int64 (K, 2), start and end of each burst [us].
         state: `FaultState`.
 
     Returns:
-        EVENT and which of them are noise; without those that are drawn if too many are to be expected.
+        EVENT and whether each is noise. If too many false events are expected, it returns `light` unchanged.
     """
     means, spans, are_hot = _kinds(light[0].size, span_us, bursts, state)
     state.expected[0] = means.sum()
@@ -454,7 +454,7 @@ def add_false(
 def _kinds(
     num_events: int, span_us: tuple[int, int], bursts: np.ndarray, state: FaultState
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return, of each kind of false events that is on, their mean number, when, and whether of hot pixels."""
+    """Return mean number, time span and whether of hot pixels, for each kind of false events that is on."""
     rates, seconds = state.rates, (span_us[1] - span_us[0]) * 1e-6
     most = 2 + len(bursts)
     means, spans, are_hot = np.empty(most), np.empty((most, 2), np.int64), np.zeros(most, np.bool_)
@@ -483,16 +483,16 @@ def _merged(
     t0_us: int,
     shape: tuple[int, int],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Merge events with false ones and sort them by (t, y, x); of equal ones the true events come first.
+    """Merge events with false events, sorted by (t, y, x); in ties the true events come first.
 
     Args:
         light: EVENT (N,), sorted, and their labels, bool (N,).
-        false: Times [us], flat pixels, polarities and labels of M events.
-        t0_us: A time before all of them [us].
+        false: Times [us], flat pixels, polarities and labels of M false events.
+        t0_us: A time before all false events [us].
         shape: (H, W).
 
     Returns:
-        EVENT (N + M,), and their labels.
+        EVENT (N + M,) and their labels.
     """
     (events, labels), (times, places, polarities, false_labels), width = light, false, shape[1]
     order = np.argsort((times - t0_us) * (shape[0] * width) + places, kind="mergesort")

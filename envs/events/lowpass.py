@@ -1,11 +1,11 @@
 """The bandwidth of a photoreceptor: a first-order low-pass filter between light and pixel.
 
-A camera sees through it the light that would have had the filtered response. The response is taken as
-linear from one frame to the next, as the camera takes it, and the filter's equation is then solved exactly:
-frames between two others change nothing but what they show. Where a camera looks at columns, and takes the
-light as linear between two looks, the response is taken as linear up to half-way and from there on. There,
-pixels whose light rests and whose filter has settled, three of four at 200 Hz, are left alone: the equation
-would give them the same bits.
+The camera sees the light that would have the filtered response. The response is taken as linear from one
+frame to the next, as in the camera, and the filter's equation is then solved exactly. Extra frames therefore
+change the result only through the light that they show. A column camera takes the light as linear between
+two looks; there the response is taken as linear in each half of the interval. Pixels with constant light and
+a settled filter (three of four at 200 Hz) are skipped there, because the equation would not change a bit of
+them.
 """
 
 import math
@@ -19,18 +19,18 @@ from envs.config import CameraConfig
 from envs.events.crossings import BLOCK, write_flagged
 from envs.events.photoreceptor import MAX_LUMINANCE, Curve, exponential, light_of, respond
 
-# A photoreceptor is faster where it is brighter. v2e's filter: bandwidth ~ (grey + 20) / 275, of 255 greys.
+# A photoreceptor is faster in brighter light. v2e's filter: bandwidth ~ (grey + 20) / 275, of 255 greys.
 DARK_SHARE, WHITE_SHARE = 20.0 / 275.0, 255.0 / 275.0
-MOST_PERIODS = 60.0  # after which nothing is left of what was before
-LITTLE = 1e-6  # of a period; in less the first order is exact to 1e-12 of the response
+MOST_PERIODS = 60.0  # [time constants] after which the earlier state has no effect
+LITTLE = 1e-6  # [time constants] below it the first order is exact to 1e-12 of the response
 
 
 class LowPass(NamedTuple):
-    """What N filtered pixels remember, (N,) each; changed in place.
+    """State of N filtered pixels, (N,) each; changed in place.
 
     Attributes:
-        filtered: Response behind the filter, float64.
-        response: Response before it, at the last frame, float64.
+        filtered: Response after the filter, float64.
+        response: Response before the filter, at the last frame, float64.
         light: Luminance of the last frame, float32.
     """
 
@@ -40,14 +40,14 @@ class LowPass(NamedTuple):
 
 
 class ColumnFilter(NamedTuple):
-    """The bandwidth of a camera that looks at columns of its N pixels; of no pixels if it is unlimited.
+    """The low-pass filter of a column camera with N pixels; N is 0 if the bandwidth is unlimited.
 
     Attributes:
         pixels: `LowPass`.
-        seen: float32 (N,), what the camera sees.
-        half: float64 (N,), the responses behind the filter half-way to the last look at which they moved.
-        rates: As `filter_rates` gives them.
-        room: Room for a block of pixels, float64 (10, BLOCK), and int64 (BLOCK,).
+        seen: float32 (N,), the luminance that the camera sees.
+        half: float64 (N,), the filtered responses half-way to the last look at which they moved.
+        rates: From `filter_rates`.
+        room: Room for a block of pixels, float64 (10, BLOCK) and int64 (BLOCK,).
     """
 
     pixels: LowPass
@@ -58,12 +58,12 @@ class ColumnFilter(NamedTuple):
 
 
 def low_pass(num_pixels: int) -> LowPass:
-    """Room for the pixels of a camera; `start_filter` sets it."""
+    """Allocate the filter state of a camera's pixels; `start_filter` sets it."""
     return LowPass(np.zeros(num_pixels), np.zeros(num_pixels), np.zeros(num_pixels, np.float32))
 
 
 def column_filter(config: CameraConfig) -> ColumnFilter:
-    """Return the bandwidth of a camera, before a first image."""
+    """Return the low-pass filter of a column camera, before its first image."""
     size = config.width * config.height if config.cutoff_hz > 0.0 else 0
     room = np.zeros((10, BLOCK)), np.zeros(BLOCK, np.int64)
     return ColumnFilter(
@@ -72,7 +72,7 @@ def column_filter(config: CameraConfig) -> ColumnFilter:
 
 
 def filter_rates(config: CameraConfig) -> tuple[float, float]:
-    """Angular frequency of the filter in black, and what white adds to it [rad/s]."""
+    """Return the angular frequency of the filter in black, and the increase from black to white [rad/s]."""
     rate = 2.0 * math.pi * config.cutoff_hz
     return (rate * DARK_SHARE, rate * WHITE_SHARE) if config.cutoff_grows_with_light else (rate, 0.0)
 
@@ -82,7 +82,7 @@ UNLIMITED = column_filter(CameraConfig())
 
 @numba.njit(cache=True, error_model="numpy")
 def start_filter(luminance: np.ndarray, curve: Curve, pixels: LowPass) -> None:
-    """Settle on a first frame, float32 (N,)."""
+    """Settle the filter on a first frame, float32 (N,)."""
     respond(curve, luminance, pixels.response, np.empty(luminance.size, np.int64))
     pixels.filtered[:] = pixels.response
     pixels.light[:] = luminance
@@ -90,7 +90,7 @@ def start_filter(luminance: np.ndarray, curve: Curve, pixels: LowPass) -> None:
 
 @numba.njit(cache=True, error_model="numpy")
 def start_columns(luminance: np.ndarray, curve: Curve, bandwidth: ColumnFilter) -> None:
-    """Settle on a first frame, float32 (N,), column after column."""
+    """Settle the filter of a column camera on a first frame, float32 (N,), column after column."""
     start_filter(luminance, curve, bandwidth.pixels)
     bandwidth.half[:] = bandwidth.pixels.filtered
     lights = bandwidth.pixels.filtered.copy()
@@ -103,16 +103,16 @@ def start_columns(luminance: np.ndarray, curve: Curve, bandwidth: ColumnFilter) 
 def filter_frames(
     frames: np.ndarray, times_us: np.ndarray, curve: Curve, rates: tuple, pixels: LowPass
 ) -> np.ndarray:
-    """Frames as they look behind the filter, float32 (K, N).
+    """Return the frames after the filter, float32 (K, N).
 
     With the response r(t) = r0 + s t over a frame interval T, and w the filter's angular frequency at the
     interval's mean light, v' = w (r - v) has the solution v(T) = r(T) - s / w + (v0 - r0 + s / w) exp(-w T).
 
     Args:
         frames: float32 (K, N), valid.
-        times_us: int64 (K + 1,), of the frame before them and theirs [us].
+        times_us: int64 (K + 1,), times of the previous frame and of these frames [us].
         curve: `Curve` of the camera.
-        rates: Angular frequency in black, and what white adds [rad/s].
+        rates: Angular frequency in black, and the increase from black to white [rad/s].
         pixels: `LowPass`.
     """
     size, (black, white) = frames.shape[1], rates
@@ -141,14 +141,14 @@ def _followed(filtered: float, slope: tuple, decay: float) -> float:
     """Return the filter's output after a response that is linear in time.
 
     Args:
-        filtered: What was behind it.
-        slope: The response before and after, and how much of a period of the filter, w T, lies between.
+        filtered: The filter's output before.
+        slope: The response before and after, and the time between them in time constants, w T.
         decay: exp(-w T).
     """
     before, after, periods = slope
     lag = (after - before) / periods
     followed = after - lag + (filtered - before + lag) * decay
-    little = filtered + (0.5 * (before + after) - filtered) * periods  # where that would be lost in rounding
+    little = filtered + (0.5 * (before + after) - filtered) * periods  # first order, safe from cancellation
     return followed if periods > LITTLE else little
 
 
@@ -156,14 +156,14 @@ def _followed(filtered: float, slope: tuple, decay: float) -> float:
 def _follow(
     filtered: np.ndarray, lights: tuple, responses: tuple, rates: tuple, seconds: np.ndarray, room: tuple
 ) -> None:
-    """Let photoreceptors follow responses that are linear in time; the bandwidth is that of the mean light.
+    """Filter responses that are linear in time, with the bandwidth at the mean light.
 
     Args:
-        filtered: What is behind the filter, float64 (N,), changed in place.
+        filtered: The filter's output, float64 (N,), changed in place.
         lights: Luminance before and after, float64 (N,) each.
-        responses: To it, float64 (N,) each.
-        rates: In black, and what white adds [rad/s].
-        seconds: The time between, float64 (N,) [s].
+        responses: Responses before and after, float64 (N,) each.
+        rates: Angular frequency in black, and the increase from black to white [rad/s].
+        seconds: Time between before and after, float64 (N,) [s].
         room: float64 (N,) twice, and int64 (N,).
     """
     (past, light), (before, after), (periods, decay, exponents) = lights, responses, room
@@ -187,17 +187,17 @@ def filter_columns(
     bandwidth: ColumnFilter,
     scratch: tuple[np.ndarray, np.ndarray],
 ) -> None:
-    """Let columns `first` .. `last` - 1 see new light, until when their photoreceptors follow it.
+    """Filter new light of columns `first` .. `last` - 1 since the last look at each of them.
 
     Args:
         luminance: float32 (W * H,), valid, column after column.
         first: The first column.
         last: The column after the last.
-        t_us: The time [us].
-        seen_us: int64 (W,), earlier times when each column was looked at last [us].
+        t_us: The time of the new light [us].
+        seen_us: int64 (W,), the time of the last look at each column, earlier than `t_us` [us].
         curve: `Curve` of the camera.
         bandwidth: `ColumnFilter`, changed in place.
-        scratch: As `crossings.scan` takes `flags` and `outside`.
+        scratch: `flags` and `outside` as for `crossings.scan`.
     """
     height, (flags, chosen) = luminance.size // seen_us.size, scratch
     found = _restless(luminance, first * height, last * height, bandwidth.pixels, flags, chosen)
@@ -210,7 +210,7 @@ def filter_columns(
 def _restless(
     luminance: np.ndarray, begin: int, end: int, pixels: LowPass, flags: np.ndarray, chosen: np.ndarray
 ) -> int:
-    """Write the pixels `begin` .. `end` - 1 whose light has changed or whose filter has not settled."""
+    """Write those of the pixels `begin` .. `end` - 1 whose light changed or whose filter has not settled."""
     flag, size, light = flags.view(np.uint8), end - begin, luminance[begin:end]
     past, response, filtered = pixels.light[begin:end], pixels.response[begin:end], pixels.filtered[begin:end]
     for i in range(size):
@@ -227,10 +227,10 @@ def _follow_block(
     curve: Curve,
     bandwidth: ColumnFilter,
 ) -> None:
-    """Lead at most BLOCK pixels through both halves of the time since they were looked at."""
+    """Filter at most BLOCK pixels over both halves of the time since the last look at them."""
     pixels, rates, (table, exponents) = bandwidth.pixels, bandwidth.rates, bandwidth.room
     size, height = chosen.size, luminance.size // seen_us.size
-    # Not unpacked: their strides would be unknown, and no loop over them wide.
+    # Not unpacked: the strides would be unknown, and the loops would not compile to wide instructions.
     past, middle, light = table[0][:size], table[1][:size], table[2][:size]
     before, half, after = table[3][:size], table[4][:size], table[5][:size]
     filtered, seconds, room = table[6][:size], table[7][:size], (table[8], table[9], exponents)

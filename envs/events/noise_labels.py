@@ -1,14 +1,14 @@
-"""Label the events of a noisy pixel: did the light fire them, or the noise?
+"""Label the events of a noisy pixel: whether the light fired them, or the noise.
 
-Each noisy pixel gets a noiseless one next to it, which sees the same light. Its level moves by whole
-thresholds, and only with events of the light. An event is the light's if the light alone has come at least
-half of the way from that level to the next one, and has moved by a quarter of a threshold since its last
-event. Otherwise the event is noise.
+Each noisy pixel gets a noiseless twin that sees the same light. The twin's level moves by whole thresholds,
+and only with events of the light. An event belongs to the light if the light alone has moved at least half of
+the way from that level to the next, and at least a quarter of a threshold since its last event. Otherwise the
+event is noise.
 
-So an event that noise fires a little early is the light's, and an event of a still pixel is noise. Of a level
-that leaks, as many events are noise as the noiseless pixel does not fire. The rule uses no time, so it does
-not depend on the step. A pixel's first event needs the light to move a tenth of the way only: its level may
-begin anywhere between two events.
+So an event that noise fires a little early belongs to the light, and an event of a still pixel is noise. If a
+level leaks, the events that the noiseless twin does not fire are noise. The rule does not use time, so it is
+independent of the step. For a pixel's first event the light needs to move only a tenth of the way, because
+the pixel's level may start anywhere between two events.
 """
 
 from typing import NamedTuple
@@ -20,9 +20,9 @@ from envs.compiled import inlined, kernel
 from envs.events.crossings import level_of, named
 from envs.events.photoreceptor import respond
 
-NEAR = 0.5  # of a threshold; so near the light comes to a level by itself in an event of its own
-MOVED = 0.25  # of a threshold; so far it has moved since its last event
-FIRST = 0.1  # of the way to a pixel's first event; so far it has moved by then
+NEAR = 0.5  # of a threshold: smallest change of the light from the level at an event of the light
+MOVED = 0.25  # of a threshold: smallest change of the light since its last event
+FIRST = 0.1  # of the way to a pixel's first event: smallest change of the light, if the event is the light's
 
 
 class Noiseless(NamedTuple):
@@ -30,10 +30,10 @@ class Noiseless(NamedTuple):
 
     Attributes:
         level: Level of the noiseless pixel.
-        rest: Response at the last event of the light, and until there is one at the first frame.
+        rest: Response at the last event of the light, or at the first frame before any.
         noisy: Level of the noisy pixel at the end of the last interval; NaN in a refractory period.
         is_new: Whether the light has not fired yet, bool.
-        waits: Whether the level follows at the end of the pixel's refractory period, bool.
+        waits: Whether `level` must be set at the end of the pixel's refractory period, bool.
     """
 
     level: np.ndarray
@@ -44,7 +44,7 @@ class Noiseless(NamedTuple):
 
 
 class NoiseLabels:
-    """The noiseless pixels of one camera, and the labels that follow from them."""
+    """The noiseless pixels of one camera, and the labels derived from them."""
 
     def __init__(self, state: tuple, numbers: np.ndarray, rest: np.ndarray) -> None:
         """Start with the levels of a camera whose noise has just been drawn.
@@ -74,12 +74,12 @@ class NoiseLabels:
 
         Args:
             light: Flat pixels y * W + x and polarities of the events that the camera fired, in time order.
-            noise: The same of the events that `pixel_noise.fire` returned, in its order.
+            noise: Pixels and polarities of the events from `pixel_noise.fire`, in its order.
             t1_us: End of the interval [us].
-            kept: `kept` and `kept_us` of the pixel noise as they were before it was fired.
+            kept: `kept` and `kept_us` of the pixel noise before it was fired.
 
         Returns:
-            Which events of `light` and of `noise` are noise, bool each.
+            Whether each event of `light` and of `noise` is noise, two bool arrays.
         """
         (places, signs), (noisy_places, noisy_signs) = (
             (self._place[pixels], polarities.astype(np.int64)) for pixels, polarities in (light, noise)
@@ -113,7 +113,7 @@ def label(light, noise, t1_us, kept, model, memory, noiseless):
     rows, shared = model, memory
     model, memory = named(model, memory)
     of_light, of_noise = np.zeros(light[0].size, np.bool_), np.ones(noise[0].size, np.bool_)
-    if model.rule.forgets:  # its level is the last frame's light: what noise fires, noise fires alone
+    if model.rule.forgets:  # the level is the last frame's, so exactly the events of `noise` are noise
         return of_light, of_noise
     for k in range(of_light.size):
         i, sign = light[0][k], light[1][k]
@@ -137,16 +137,17 @@ def label(light, noise, t1_us, kept, model, memory, noiseless):
 
 @inlined
 def _threshold(i, sign, model):
-    """Threshold of a pixel in one direction."""
+    """Return the threshold of a pixel in one direction."""
     k = i if model.thresholds.on.size > 1 else 0
     return model.thresholds.on[k] if sign > 0 else model.thresholds.off[k]
 
 
 @inlined
 def _is_noise(i, sign, size, response, noiseless):
-    """Whether the noise fired an event; if not, the noiseless pixel's level moves.
+    """Whether the noise fired an event; if not, this also moves the noiseless pixel's level.
 
-    It moves by whole thresholds to the one nearest to the light: the noisy pixel may have missed some.
+    The level moves by whole thresholds to the one nearest to the light, because the noisy pixel may have
+    missed some.
     """
     moved, change = sign * (response - noiseless.rest[i]), sign * (response - noiseless.level[i])
     if noiseless.is_new[i]:
@@ -162,16 +163,16 @@ def _is_noise(i, sign, size, response, noiseless):
 
 @inlined
 def _settle(i, response, noiseless):
-    """Set the level of a noiseless pixel to the light's."""
+    """Set the level of a noiseless pixel to the response to its light."""
     noiseless.level[i] = noiseless.rest[i] = response
     noiseless.is_new[i] = False
 
 
 @kernel
 def _leave_refractory_periods(memory, kept, noiseless):
-    """Set the noiseless pixel's level to the light's where a refractory period has ended, as the camera does.
+    """Set a noiseless pixel's level to the light at the end of its refractory period, as the camera does.
 
-    The noisy pixel's level then is the light's plus the noise that was kept. Earlier noise has no effect.
+    The noisy pixel's level is then the light's plus the noise that was kept. Earlier noise has no effect.
     """
     for i in range(noiseless.waits.size):
         if noiseless.waits[i] and not np.isnan(noiseless.noisy[i]):

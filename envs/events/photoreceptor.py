@@ -1,8 +1,8 @@
-"""What a pixel makes of light: an exact logarithm, the response curve, 8-bit encodings.
+"""From light to a pixel's response: a reproducible logarithm, the response curve, 8-bit encodings.
 
-The logarithm is built from +, -, *, / and bit shifts alone, which IEEE 754 rounds in one way,
-so that a level is crossed on every machine or on none; and a loop over it compiles to wide
-instructions, which no call of a library's `log` does.
+The logarithm uses only +, -, *, / and bit shifts, which IEEE 754 rounds in exactly one way, so
+that a level is crossed on every machine or on none. A loop over it compiles to wide
+instructions, unlike calls of a library's `log`.
 """
 
 import math
@@ -25,9 +25,9 @@ class Curve(NamedTuple):
 
     Attributes:
         shift: Added to the luminance L.
-        knee: Luminance below which the response is linear; 0: nowhere.
-        gain: Slope there.
-        lowest: Logarithm of the knee, -inf without one.
+        knee: Luminance below which the response is linear; 0: it is linear nowhere.
+        gain: Slope of the linear part.
+        lowest: Logarithm of the knee; -inf if the knee is 0.
     """
 
     shift: float
@@ -53,11 +53,11 @@ def response_curve(response: str, luminance_floor: float) -> Curve:
 
 @kernel
 def natural_logarithm(values, exponents):
-    """Replace each of `values` (float64, normal, > 0) by its logarithm; `exponents` is room, int64 as many.
+    """Replace each of `values` (float64, normal, > 0) by its logarithm; `exponents` is room, int64 (N,).
 
     x = 2^k (1 + f) with 1 + f in [sqrt(1/2), sqrt(2)); log(1 + f) is the odd series in
-    s = f / (2 + f), as in Tang (1990) and fdlibm. Error below 1 ulp
-    (tests/envs/events/test_extremes.py).
+    s = f / (2 + f), as in Tang (1990) and fdlibm. The error is below 1 ulp
+    (tests/envs/events/test_photoreceptor.py).
     """
     bits = values.view(np.int64)
     for i in range(values.size):
@@ -81,7 +81,7 @@ def natural_logarithm(values, exponents):
 
 @kernel
 def respond(curve, luminance, levels, exponents):
-    """Write into the first `levels` (float64) the responses to `luminance` (float32, finite, >= 0).
+    """Write the responses to `luminance` (float32 (N,), finite, >= 0) into the first N `levels` (float64).
 
     `exponents` is room, int64 (N,).
     """
@@ -122,7 +122,7 @@ def exponential(values, exponents):
 
 @kernel
 def light_of(curve, levels, exponents):
-    """Replace responses (float64) by their luminances; below 0 where no luminance responds so low.
+    """Replace responses (float64) by their luminances; negative if no luminance has so low a response.
 
     `exponents` is room, int64 (N,).
     """
@@ -131,7 +131,7 @@ def light_of(curve, levels, exponents):
         for i in range(levels.size):
             levels[i] -= curve.shift
         return
-    first = 0  # of a run above the knee: the exponential is fast over many
+    first = 0  # start of a run above the knee, because the exponential is fast over long runs
     for i in range(levels.size):
         if levels[i] < curve.lowest:
             exponential(levels[first:i], exponents[first:i])
@@ -141,10 +141,10 @@ def light_of(curve, levels, exponents):
 
 
 def encoding_tables(encoding: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return where an 8-bit encoding changes its code, float32 (255,), and the value of each, float32 (256,).
+    """Return an 8-bit encoding's bounds between codes, float32 (255,), and the codes' values, float32 (256,).
 
-    "linear8" rounds the luminance to the nearest multiple of 1/255; "gamma8" rounds its power
-    1/2.2 so, and decodes it again. Light above 1 has code 255.
+    "linear8" rounds the luminance to the nearest multiple of 1/255. "gamma8" rounds the luminance to the
+    power 1/2.2 in the same way, and decodes the result. Light above 1 has code 255.
     """
     gamma = {"linear8": 1.0, "gamma8": GAMMA}[encoding]
     codes = np.arange(256) / 255.0
@@ -154,7 +154,7 @@ def encoding_tables(encoding: str) -> tuple[np.ndarray, np.ndarray]:
 
 @numba.njit(cache=True, error_model="numpy")
 def encode(luminance, bounds, meanings, out):
-    """Write the 8-bit version of `luminance` into `out`; index of the first invalid value, or -1."""
+    """Write the 8-bit version of `luminance` into `out`; return the first invalid index, or -1."""
     for i in range(luminance.size):
         light = luminance[i]
         if not 0.0 <= light <= MAX_LUMINANCE:

@@ -1,22 +1,23 @@
-"""Noise that acts on the pixel: leakage that moves its level, and shot noise that crosses its levels.
+"""Noise inside the pixel: leakage moves its level, and shot noise crosses its levels.
 
-Both are events like any other: they move the level that the pixel remembers, wait for the end of its
-refractory period, and start one. So a still pixel does not drift.
+Noise events are like any other event: they move the level that the pixel remembers, wait for the end of its
+refractory period, and start a new one. So a still pixel does not drift.
 
 Leakage lowers the level at the pixel's rate, one threshold from one ON event of a still pixel to the next.
 
-Shot noise is a stationary Ornstein-Uhlenbeck process x on top of the pixel's response, with standard
-deviation sigma, a share of the pixel's thresholds, and the time constant tau of the photoreceptor. From its
-mean up to d, it needs a mean time of (Siegert 1951; Hendrickson & Haefner, arXiv:2504.02803)
+Shot noise is a stationary Ornstein-Uhlenbeck process x on top of the pixel's response. Its standard deviation
+sigma is a share of the pixel's thresholds; its time constant tau is the photoreceptor's. The mean time from
+its mean up to a displacement d is (Siegert 1951; Hendrickson & Haefner, arXiv:2504.02803)
 
     m(d) = tau sqrt(2 pi) * integral of exp(y^2 / 2) Phi(y) dy from 0 to d / sigma,
 
-and, if d is not small, it takes an exponentially distributed time. From d back to the mean it takes exactly
-(tau / 2) log(1 + (d / sigma Z)^2), Z a normal number. Then the level just left is the nearer one: ON and OFF
-alternate. So events are drawn by waiting times, and no step of the simulation is too long (first passages:
-Graca & Delbruck, arXiv:2505.07386). Sigma is chosen so that the rate, in the closed form of `mean_rate`, is
-`shot_noise_hz` on average over all levels that a pixel may remember. A refractory period of tau or more
-makes the noise rarer: at its end the level is the light's, and not a threshold away.
+and, if d is not small, this time is exponentially distributed. The time from d back to the mean is exactly
+(tau / 2) log(1 + (d / sigma Z)^2) with a normal number Z. After that the level just left is the nearer one,
+so ON and OFF alternate. Events are therefore drawn by waiting times, and no step of the simulation is too
+long (first passages: Graca & Delbruck, arXiv:2505.07386). Sigma is chosen so that the rate, in the closed
+form of `mean_rate`, is `shot_noise_hz` on average over all levels that a pixel may remember. A refractory
+period of tau or more makes the noise rarer, because at its end the level is at the light, not a threshold
+away.
 """
 
 import math
@@ -43,13 +44,13 @@ from envs.events.crossings import (
 from envs.events.emission import Span
 from envs.events.refractory import never_be_quiet
 
-DEFAULT_BANDWIDTH_HZ = 300.0  # of the noise where the photoreceptors have none: v2e's cutoff by day
-SHOT_NOISE_FALL = 0.75  # from black to white, as a share of the noise in black (v2e)
-FIRED = 1024  # events, for which there is room at first
-PER_SIGMA = 64  # entries of the table of waiting rates
-MOST_SIGMAS, FEWEST_SIGMAS = 12.0, 0.5  # of a threshold
-SLICE = 1 / 32  # of a threshold, the most that a level leaks before the waiting times are taken again
-SAME_LIGHT = 5e-4  # relative; a change of the light that the waiting times need not follow
+DEFAULT_BANDWIDTH_HZ = 300.0  # of the noise if photoreceptors have no bandwidth limit: v2e's cutoff by day
+SHOT_NOISE_FALL = 0.75  # decrease from black to white, as a share of the noise in black (v2e)
+FIRED = 1024  # initial room for events
+PER_SIGMA = 64  # entries per sigma in the tables of passage times and rates
+MOST_SIGMAS, FEWEST_SIGMAS = 12.0, 0.5  # range of a threshold in sigmas
+SLICE = 1 / 32  # of a threshold: largest leak of a level before the waiting times are computed again
+SAME_LIGHT = 5e-4  # relative change of the light below which the waiting times are not updated
 
 
 class Noise(NamedTuple):
@@ -57,17 +58,17 @@ class Noise(NamedTuple):
 
     Attributes:
         leak: Thresholds per second by which each level falls, until the pixel's next leak event.
-        leak_mean: The mean of it.
-        shot: Each pixel's rate of shot noise, as a multiple of that of others in black.
-        budget: What was left of each pixel's waiting time, in mean waiting times, at the time
-        from_us: From which it is used up [us], at
-        pace: So many mean waiting times per microsecond.
-        since_us: Until when each pixel's leakage is in its level [us].
-        rest_us: Until when each pixel's noise returns to its mean [us].
-        kept: Noise that a pixel kept as a part of its level at the end of a refractory period.
-        due_us: When each pixel is to be looked at again, if light and level stay.
-        light, band: Its light and the lower end of its quiet band at the last look, float32.
-        kept_us: When that period ends [us], int64.
+        leak_mean: Mean of `leak`.
+        shot: Each pixel's rate of shot noise over the nominal rate.
+        budget: Each pixel's remaining waiting time at `from_us`, in mean waiting times.
+        from_us: Time from which `budget` is used up [us].
+        pace: Rate at which `budget` is used up [mean waiting times per us].
+        since_us: Time up to which each level includes its leakage [us].
+        rest_us: Time until which each pixel's noise returns to its mean [us].
+        kept: Noise that becomes part of a pixel's level at the end of a refractory period.
+        due_us: Time when each pixel must be updated again, if light and level stay the same [us].
+        light, band: Each pixel's light and lower end of its quiet band at the last update, float32.
+        kept_us: End of the refractory period of `kept` [us], int64.
     """
 
     leak: np.ndarray
@@ -90,10 +91,10 @@ class Process(NamedTuple):
 
     Attributes:
         sigma: Standard deviation of the shot noise, as a share of a pixel's mean threshold; 0: none.
-        tau_us: Its time constant [us].
+        tau_us: Time constant of the shot noise [us].
         rates: Rate of passages by distance, in steps of sigma / PER_SIGMA [1 / us].
-        jitter: Of leakage.
-        slice_us: Longest time in which leakage may be put off [us].
+        jitter: Jitter of leakage, `FaultsConfig.leak_jitter`.
+        slice_us: Longest time between two updates of the leakage [us].
     """
 
     sigma: float
@@ -105,7 +106,7 @@ class Process(NamedTuple):
 
 @lru_cache(maxsize=1)
 def passage_times() -> np.ndarray:
-    """Mean time from the mean up to k / PER_SIGMA sigmas, in units of tau; float64."""
+    """Return the mean time from the mean up to k / PER_SIGMA sigmas, in units of tau; float64."""
     fine = 16
     y = np.arange(int(MOST_SIGMAS * PER_SIGMA * fine) + 1) / (PER_SIGMA * fine)
     below = np.array([0.5 * math.erfc(-value / math.sqrt(2.0)) for value in y])
@@ -116,9 +117,9 @@ def passage_times() -> np.ndarray:
 
 @lru_cache(maxsize=1)
 def return_times() -> np.ndarray:
-    """Mean time from k / PER_SIGMA sigmas back to the mean, in units of tau; float64.
+    """Return the mean time from k / PER_SIGMA sigmas back to the mean, in units of tau; float64.
 
-    sqrt(2 pi) times the integral of exp(y^2 / 2) Phi(-y): Siegert's formula on the other side.
+    It is sqrt(2 pi) times the integral of exp(y^2 / 2) Phi(-y), Siegert's formula for the other direction.
     """
     y = np.arange(int(MOST_SIGMAS * PER_SIGMA) + 1) / PER_SIGMA
     above = np.array([math.exp(0.5 * v * v) * 0.5 * math.erfc(v / math.sqrt(2.0)) for v in y])
@@ -127,10 +128,10 @@ def return_times() -> np.ndarray:
 
 
 def mean_rate(sigmas: float) -> float:
-    """Shot noise events per tau of a still pixel whose threshold is so many sigmas, over all its levels.
+    """Return a still pixel's shot noise events per tau at `sigmas` sigmas a threshold, averaged over levels.
 
-    Of the two levels next to the light's, one stands a share f of a threshold below it: the way from one to
-    the other and back is a pair of events. So is a passage outwards, beyond the nearer level.
+    Of the two levels around the light, the lower one is a share f of a threshold below it. A passage from one
+    level to the other and back is a pair of events. So is a passage outwards, beyond the nearer level.
     """
     share, grid = (np.arange(256) + 0.5) / 256, np.arange(passage_times().size) / PER_SIGMA
     inwards = np.interp(sigmas * share, grid, passage_times())
@@ -142,10 +143,10 @@ def mean_rate(sigmas: float) -> float:
 
 @lru_cache(maxsize=16)
 def threshold_in_sigmas(events_per_tau: float) -> float:
-    """Compute how many sigmas a threshold is, for so many shot noise events per tau.
+    """Compute the size of a threshold in sigmas from the rate of shot noise events per tau.
 
     Raises:
-        ValueError: If noise of that bandwidth cannot cross thresholds as often.
+        ValueError: Noise of this bandwidth cannot cross thresholds that often.
     """
     low, high = FEWEST_SIGMAS, MOST_SIGMAS
     if events_per_tau > mean_rate(low):
@@ -170,14 +171,14 @@ class Noisy(NamedTuple):
 
 
 class Still(NamedTuple):
-    """A pixel whose light rests.
+    """A pixel under constant light.
 
     Attributes:
-        pixel: Its number.
-        response: To its light.
-        light: Its luminance.
-        low, high: Changes of the response down and up to its next events, at the end of the span.
-        from_us: From when on [us].
+        pixel: Number of the pixel.
+        response: Response to its light.
+        light: Luminance of the pixel.
+        low, high: Changes of the response down and up to the next events, at the end of the span.
+        from_us: Time from which its noise is simulated [us].
     """
 
     pixel: int
@@ -189,13 +190,13 @@ class Still(NamedTuple):
 
 
 class PixelState(NamedTuple):
-    """The noise of one camera's pixels, as compiled code takes it.
+    """The noise of one camera's pixels, in the form that compiled code takes.
 
     Attributes:
-        rows: Arrays of a `Noise`, as `_noise` takes them; of no pixels if there is no noise.
+        rows: Arrays of a `Noise`, as for `_noise`; of 0 pixels if there is no noise.
         process: `Process`.
         rng: Source of all draws.
-        scratch: Two rooms for blocks of pixels, and flags and room as `crossings.scan` has.
+        scratch: Two rooms for blocks of pixels, and flags and room as for `crossings.scan`.
     """
 
     rows: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
@@ -206,13 +207,13 @@ class PixelState(NamedTuple):
 
 @lru_cache(maxsize=4)
 def _scratch(size: int) -> tuple:
-    """Scratch for `size` pixels, which all cameras of a process share: it stays in the cache."""
+    """Allocate scratch for `size` pixels; all cameras of a process share it, so it stays in the cache."""
     words = (size + 7) // 8
     return make_room(), make_room(), np.zeros(words, np.uint64), np.zeros(8 * words, np.int64)
 
 
 def no_noise(rng: np.random.Generator) -> PixelState:
-    """Return the state of a camera whose pixels have no noise; nothing is drawn."""
+    """Return the state of a camera whose pixels have no noise; it draws nothing from `rng`."""
     rows = np.zeros((0, 9)), np.zeros((2, 0), np.float32), np.zeros(0), np.zeros(0, np.int64)
     return PixelState(rows, Process(0.0, 1.0, np.zeros(2), 0.0, 1.0), rng, _scratch(0))
 
@@ -233,18 +234,18 @@ class PixelNoise:
         t_us: int,
         rng: np.random.Generator,
     ) -> None:
-        """Draw the noise of a camera that has just seen its first frame; levels begin anywhere.
+        """Draw the noise of a camera that has just seen its first frame; levels start at random places.
 
         Args:
-            camera: Its settings.
-            faults: The noise's.
-            state: `EventCamera.state` of it.
-            numbers: int64 (N,), the flat pixel y * W + x of each pixel of its memory; -1: a dead one.
-            t_us: The time of that frame [us].
+            camera: Settings of the camera.
+            faults: Settings of the noise.
+            state: `EventCamera.state` of the camera.
+            numbers: int64 (N,), the flat pixel y * W + x of each pixel of its memory; -1: dead.
+            t_us: The time of the first frame [us].
             rng: Source of all draws.
 
         Raises:
-            ValueError: If `shot_noise_hz` cannot be had with the bandwidth of the pixels.
+            ValueError: The bandwidth of the pixels is too low for `shot_noise_hz`.
         """
         self._model, self._memory, _ = state
         size, alive = numbers.size, numbers >= 0
@@ -267,7 +268,7 @@ class PixelNoise:
         move_levels(self._model, self._memory, -rng.random(size) * alive)
 
     def events(self, t0_us: int, t1_us: int) -> np.ndarray:
-        """Return the noise events of (t0_us, t1_us], after those of the light, which is the light of t1_us.
+        """Return the noise events of (t0_us, t1_us]; call it after the camera has seen the light of t1_us.
 
         Returns:
             As `fire`.
@@ -285,7 +286,7 @@ class PixelNoise:
 def move_levels(model, memory, shares):
     """Move all remembered levels by these shares of the ON threshold, and the quiet bands with them.
 
-    From now on the bands are kept: noise moves levels on which the camera does not look until the light does.
+    It also switches to stored bands, because from now on noise moves levels between the camera's own updates.
     """
     model, memory = named(model, memory)
     memory.is_banded[0] = True
@@ -299,13 +300,13 @@ def move_levels(model, memory, shares):
 
 @numba.njit(cache=True, error_model="numpy")
 def fire(t0_us, t1_us, model, memory, state):
-    """Fire the noise of (t0_us, t1_us], after the events of the light, which is the light of t1_us.
+    """Fire the noise of (t0_us, t1_us], after the events of the light, under the light of t1_us.
 
     Args:
-        t0_us: When the interval begins [us].
-        t1_us: When it ends [us].
-        model: Of the camera, as `EventCamera.state` has it.
-        memory: As there.
+        t0_us: Start of the interval [us].
+        t1_us: End of the interval [us].
+        model: Model of the camera, as in `EventCamera.state`.
+        memory: Memory of the camera, as in `EventCamera.state`.
         state: `PixelState`, changed in place.
 
     Returns:
@@ -314,7 +315,7 @@ def fire(t0_us, t1_us, model, memory, state):
     (real, seen, due_us, kept_us), process, rng, scratch = state
     model, memory = named(model, memory)
     noise, (room, spare, flags, changed) = _noise(real, seen, due_us, kept_us), scratch
-    parts = 1 + np.int64((t1_us - t0_us) / process.slice_us)  # cut finely enough for leakage
+    parts = 1 + np.int64((t1_us - t0_us) / process.slice_us)  # fine enough for leakage
     noisy = Noisy(model, memory, noise, process)
     fired, count = np.empty((3, FIRED), np.int64), 0
     for part in range(parts):
@@ -343,7 +344,7 @@ def fire(t0_us, t1_us, model, memory, state):
 
 @numba.njit(cache=True, error_model="numpy")
 def _with_more_room(fired):
-    """Copy the events into twice the room."""
+    """Return a copy of the events with twice the room."""
     larger = np.empty((3, 2 * fired.shape[1]), np.int64)
     larger[:, : fired.shape[1]] = fired
     return larger
@@ -351,7 +352,7 @@ def _with_more_room(fired):
 
 @numba.njit(cache=True, error_model="numpy", inline="always")
 def _noise(real, seen, due_us, kept_us):
-    """`Noise` of float64 (N, 9), whose rows are read together, float32 (2, N), and two more of (N,)."""
+    """Return a `Noise` of float64 (N, 9), whose rows are read together, float32 (2, N), and two of (N,)."""
     return Noise(
         real[:, 0], real[:, 1], real[:, 2], real[:, 3], real[:, 4], real[:, 5], real[:, 6], real[:, 7],
         real[:, 8], due_us, seen[0], seen[1], kept_us,
@@ -360,7 +361,7 @@ def _noise(real, seen, due_us, kept_us):
 
 @kernel
 def _find(span, memory, noise, flags, changed):
-    """Write the pixels whose light or level has changed, or whose time has come; return how many."""
+    """Write the pixels whose light or level has changed, or which are due; return their number."""
     flag, end_us, size = flags.view(np.uint8), np.float64(span.end_us), noise.due_us.size
     for i in range(size):
         other = abs(memory.previous[i] - noise.light[i]) > SAME_LIGHT * noise.light[i]
@@ -370,7 +371,7 @@ def _find(span, memory, noise, flags, changed):
 
 @kernel
 def _restore(pixels, now_us, memory, noise):
-    """Add what pixels kept of the noise to the levels that they took at the end of a refractory period."""
+    """Add the noise that pixels kept to the levels that they took at the end of a refractory period."""
     if memory.refractory_end_us.size > 0:
         for i in pixels:
             if noise.kept_us[i] < now_us and noise.kept[i] != 0.0:
@@ -382,10 +383,10 @@ def _restore(pixels, now_us, memory, noise):
 
 @kernel
 def _wait(pixels, span, noisy, room):
-    """Lead pixels through a span, under the light at its end, if nothing fires; else mark them.
+    """Advance pixels through a span, under the light at its end, if they do not fire; otherwise mark them.
 
-    Into the columns of `room`: `low` and `high`, the changes down and up to the next events at the end of the
-    span; `after`, 1 where an event comes within it. `before` has the responses.
+    Of the columns of `room`, `before` holds the responses. The function fills `low` and `high` with the
+    changes down and up to the next events at the end of the span, and sets `after` to 1 for pixels that fire.
     """
     model, memory, noise, process = noisy
     for j in range(pixels.size):
@@ -414,14 +415,14 @@ def _wait(pixels, span, noisy, room):
 
 @inlined
 def _thresholds(i, model):
-    """ON and OFF threshold of a pixel."""
+    """Return the ON and OFF threshold of a pixel."""
     k = i if model.thresholds.on.size > 1 else 0
     return model.thresholds.on[k], model.thresholds.off[k]
 
 
 @inlined
 def _free_us(i, memory, noise):
-    """When a pixel's noise has returned to its mean and its refractory period is over [us]."""
+    """Return the time when a pixel's noise is back at its mean and its refractory period is over [us]."""
     if memory.refractory_end_us.size > 0:
         return max(noise.rest_us[i], np.float64(memory.refractory_end_us[i]))
     return noise.rest_us[i]
@@ -429,7 +430,7 @@ def _free_us(i, memory, noise):
 
 @inlined
 def _schedule(i, light, now_us, low, high, fall, rate, noisy):
-    """When a pixel is to be looked at again, if its light rests: at an event at the latest."""
+    """Set the time of a pixel's next update if its light stays the same: at the latest at its next event."""
     memory, noise, process = noisy.memory, noisy.noise, noisy.process
     begin_us = max(np.float64(now_us), _free_us(i, memory, noise))
     noise.pace[i], noise.from_us[i] = rate, begin_us
@@ -442,7 +443,7 @@ def _schedule(i, light, now_us, low, high, fall, rate, noisy):
 
 @inlined
 def _rate(change, sigma, process):
-    """Rate at which noise of that standard deviation reaches a change of the response [1 / us]."""
+    """Return the rate at which noise of deviation `sigma` reaches a change of the response [1 / us]."""
     if sigma == 0.0:
         return 0.0
     place = min(max(change / sigma, 0.0) * PER_SIGMA, process.rates.size - 2.0)
@@ -452,13 +453,13 @@ def _rate(change, sigma, process):
 
 @inlined
 def _dimmed(shot, light):
-    """Rate of shot noise under a light, as a multiple of that in black."""
+    """Return the rate of shot noise under a light, as a multiple of the nominal rate in black."""
     return shot * (1.0 - SHOT_NOISE_FALL * min(np.float64(light), 1.0))
 
 
 @kernel
 def _return_us(displaced, sigma, normal, process):
-    """Time in which the noise returns from a displacement to its mean [us], of a normal number."""
+    """Return the time in which noise returns from a displacement to its mean [us]; `normal` is random."""
     if displaced == 0.0 or sigma == 0.0:
         return 0.0
     ratio = displaced / (sigma * normal)
@@ -470,7 +471,7 @@ def _fire_pixel(still, span, now_us, noisy, rng, fired, count):
     """Add the events of one pixel in a span, one after the other, and set its level.
 
     Returns:
-        How many events there are in `fired`, and the pixel. If there is no more room, fire it again.
+        The number of events in `fired`, and the pixel. If `fired` is full, call it again with more room.
     """
     model, memory, noise, process = noisy
     i, refractory_us = still.pixel, model.rule.refractory_us
@@ -521,7 +522,7 @@ def _is_free(i, now_us, model, memory):
 
 @kernel
 def _set_bands(pixels, noisy, levels, room):
-    """Set the quiet bands of pixels that fired; together, for which exponentials are fast."""
+    """Set the quiet bands of pixels that fired, together, because exponentials are fast in blocks."""
     model, memory, noise, _ = noisy
     for j in range(pixels.size):
         on, off = _thresholds(pixels[j], model)
@@ -533,10 +534,10 @@ def _set_bands(pixels, noisy, levels, room):
 
 @kernel
 def _rest(still, event_us, now_us, displaced, sigma, noisy, rng):
-    """Start a refractory period; when it ends [us], and how far the noise, and so the level, is off by then.
+    """Start a refractory period; return its end [us] and the displacement of noise and level at that time.
 
-    A period that outlasts the last frame is ended by the camera, which takes the light of that moment as the
-    level; what the noise adds to it is kept until then.
+    If the period outlasts the last frame, the camera ends it and takes the light of that moment as the level.
+    The displacement by the noise is stored until then.
     """
     model, memory, noise, process = noisy
     refractory_us = model.rule.refractory_us

@@ -1,16 +1,16 @@
-"""Events of pixels that are looked at column by column, each column at times of its own.
+"""Events of a column camera, which looks at the columns of an image separately, each at its own times.
 
-A column lies together in memory: pixel x, y of an image of H rows is number x * H + y.
+Images are stored column after column: pixel x, y of an image of H rows is number x * H + y.
 
-Between two looks the light of a pixel is taken as linear in time. So it is where an edge moves
+Between two looks the light of a pixel is taken as linear in time. This is exact while an edge moves
 through the pixel at constant speed, because a pixel sees the mean over its area. The response to
-light then is not linear, and each crossing has a time of its own: when the light is what the
-crossed level responds to.
-Behind photoreceptors of limited bandwidth (`envs.events.lowpass`) the response goes along an
-exponential through what it was at the last look, half-way and now.
+light is then not linear, so the time of each crossing is computed from the light: it is the time at
+which the light reaches the value that belongs to the crossed level.
+With photoreceptors of limited bandwidth (`envs.events.lowpass`) the response follows an exponential
+through its values at the last look, half-way and now.
 
-Which levels are crossed is decided as in `envs.events.crossings`, for a camera that remembers
-("reference") and has no refractory period.
+The crossed levels are found as in `envs.events.crossings`, for a camera with memory "reference"
+and no refractory period.
 """
 
 from typing import NamedTuple
@@ -39,22 +39,22 @@ from envs.events.lowpass import ColumnFilter, column_filter, filter_columns, sta
 from envs.events.photoreceptor import Curve, light_of, natural_logarithm
 from envs.events.refractory import TOLERANCE
 
-STRAIGHT, STEEPEST = 1e-3, 1e6  # ratios of the halves of a way: no curve below it, as steep as any beyond
+STRAIGHT, STEEPEST = 1e-3, 1e6  # ratio of a ramp's halves: straight within 1 +- STRAIGHT; limited to STEEPEST
 
 
 class Ramps(NamedTuple):
-    """The ways of pixels that fire, from one look at each to the next: light, behind a filter responses.
+    """The changes in firing pixels from one look to the next: of luminance, or of the filtered response.
 
     Attributes:
-        pixels: Their numbers, int64.
-        columns: Their columns, int64.
-        crossings: Levels crossed, negative if downwards, int64.
-        sent: How many of them become events, int64.
-        level, stride: The first level crossed, and from one to the next, float64.
-        base: Luminance at the first look, behind a filter the response, float64.
-        pace: Time that a change of that by 1 takes [us]; 0: all is due at once, float64.
-        ratio: Change in the second half of the time by that in the first; 1: on a line, otherwise
-            on an exponential, float64.
+        pixels: Numbers of the pixels, int64.
+        columns: Columns of the pixels, int64.
+        crossings: Number of levels crossed, negative if downwards, int64.
+        sent: Number of crossings that become events, int64.
+        level, stride: The first level crossed, and the distance from one level to the next, float64.
+        base: Luminance at the first look, or the response if it is filtered, float64.
+        pace: Time that a change of `base` by 1 takes [us]; 0: all events are due at once, float64.
+        ratio: Change in the second half of the time over the change in the first half; 1: the ramp is
+            a line, otherwise an exponential, float64.
         start_us: Time of the first look, int64.
         length_us: Time between the looks, int64.
     """
@@ -73,16 +73,16 @@ class Ramps(NamedTuple):
 
 
 class Watch(NamedTuple):
-    """A camera that is looked through column by column.
+    """A column camera, in the form that kernels take.
 
     Attributes:
         model: `Model`.
         memory: `Memory` of all pixels.
-        seen_us: int64 (W,), when each column was looked at last [us].
-        scratch: As `crossings.steps` takes it.
+        seen_us: int64 (W,), time of the last look at each column [us].
+        scratch: The scratch of `crossings.steps`.
         ramps: Room for the `Ramps` between two renders.
         room: `Room` for a block of pixels.
-        bandwidth: Of its photoreceptors.
+        bandwidth: Low-pass filter of the photoreceptors.
     """
 
     model: Model
@@ -95,28 +95,28 @@ class Watch(NamedTuple):
 
 
 def make_ramps(size: int) -> Ramps:
-    """Room for `size` ramps."""
+    """Allocate room for `size` ramps."""
     whole, real = np.empty((6, size), np.int64), np.empty((5, size))
     return Ramps(*whole[:4], *real, *whole[4:])
 
 
 def can_look(camera: CameraConfig) -> bool:
-    """Whether a camera follows the rules of this file; others need whole images."""
+    """Whether this file can simulate a camera with these settings; other cameras need whole images."""
     events = camera.width * camera.height * camera.max_events_per_pixel
     exact = camera.encoding == "linear32" and camera.refractory_us == 0
     return camera.memory == "reference" and exact and events <= MAX_EVENTS_PER_FRAME
 
 
 class ColumnCamera:
-    """What an `EventCamera` of the same settings knows and remembers, to be looked through by columns.
+    """An event camera that looks at single columns, with the model and memory of an `EventCamera`.
 
     Attributes:
-        state: Model, memory and scratch as those of an `EventCamera`, with the pixels' numbers of this file.
-        bandwidth: Of its photoreceptors, `ColumnFilter`.
+        state: Model, memory and scratch as in `EventCamera`, but with pixels numbered as in this file.
+        bandwidth: Low-pass filter of the photoreceptors, `ColumnFilter`.
     """
 
     def __init__(self, config: CameraConfig) -> None:
-        """Make a camera, of which `can_look` holds."""
+        """Create the camera; requires `can_look(config)`."""
         (rule, curve, limits), memory, scratch = EventCamera(config).state
         self._shape = config.height, config.width
         if limits.shape[1] > 1:
@@ -131,13 +131,13 @@ class ColumnCamera:
 
     @property
     def last_frame(self) -> np.ndarray:
-        """Return the last frame, float32 (H, W), as it was seen before any filter; not a copy."""
+        """Return the last frame before any filter, float32 (H, W); not a copy."""
         limited = self.bandwidth.seen.size > 0
         frame: np.ndarray = self.bandwidth.pixels.light if limited else self.state[1][0][0]
         return frame.reshape(self._shape[::-1]).T
 
     def reset(self, luminance: np.ndarray) -> None:
-        """Remember a first frame, float32 (H, W), valid; it makes no events."""
+        """Remember a valid first frame, float32 (H, W); it gives no events."""
         flat = luminance.T.ravel()
         if self.bandwidth.seen.size:
             start_columns(flat, Curve(*self.state[0][1]), self.bandwidth)
@@ -146,18 +146,18 @@ class ColumnCamera:
 
 @kernel
 def look_at(image, first, last, t_us, watch, kept):
-    """Look at columns `first` .. `last` - 1 of an image: keep the ramps of their pixels that fire.
+    """Look at columns `first` .. `last` - 1 of an image: store the ramps of their firing pixels.
 
     Args:
         image: float32 (W, H), linear luminance, column after column.
         first: The first column.
         last: The column after the last.
-        t_us: The time [us], later than the last look at each of them.
-        watch: `Watch`, which remembers what is seen; its ramps have room for these pixels.
-        kept: How many of the ramps are in use.
+        t_us: The time [us], later than the last look at each of these columns.
+        watch: `Watch`, whose memory is updated; its ramps have room for these pixels.
+        kept: Number of ramps in use.
 
     Returns:
-        First invalid pixel or -1, ramps in use, and events lost.
+        First invalid pixel or -1, number of ramps in use, and number of events lost.
     """
     flat, scratch = image.reshape(image.size), watch.scratch
     flags, outside = scratch
@@ -182,7 +182,7 @@ def look_at(image, first, last, t_us, watch, kept):
         kept = _keep(pixels, flat, t_us, watch, kept)
     lost = _lost(begun, kept, ramps)
     _advance(begun, kept, watch)
-    for i in range(seen.size):  # from 0 on: of other numbers numba asks whether they are negative
+    for i in range(seen.size):  # from 0, or numba would check each index for being negative
         past[i] = seen[i]
     for column in range(first, last):
         watch.seen_us[column] = t_us
@@ -191,7 +191,7 @@ def look_at(image, first, last, t_us, watch, kept):
 
 @kernel
 def _lost(begun, kept, ramps):
-    """Levels that the newest ramps cross and send no event for."""
+    """Count the crossings of the newest ramps that send no event."""
     lost = 0
     for j in range(begun, kept):
         lost += abs(ramps.crossings[j]) - ramps.sent[j]
@@ -200,7 +200,7 @@ def _lost(begun, kept, ramps):
 
 @kernel
 def _recall(pixels, thresholds, memory, levels):
-    """Write the remembered levels of `pixels`, in a loop without branches: reads then wait together."""
+    """Write the remembered levels of `pixels`, in a loop without branches, so that memory reads overlap."""
     for j in range(pixels.size):
         k = pixels[j] if thresholds.on.size > 1 else 0
         levels[j] = level_of(memory, pixels[j], thresholds.on[k], thresholds.off[k])
@@ -208,7 +208,7 @@ def _recall(pixels, thresholds, memory, levels):
 
 @kernel
 def _keep(pixels, flat, t_us, watch, kept):
-    """Append the ramps of the pixels that fire; return how many there are now."""
+    """Append the ramps of the pixels that fire; return the new number of ramps."""
     rule, thresholds = watch.model.rule, watch.model.thresholds
     memory, seen_us, ramps, room = watch.memory, watch.seen_us, watch.ramps, watch.room
     height = flat.size // seen_us.size
@@ -240,10 +240,10 @@ def _keep(pixels, flat, t_us, watch, kept):
 
 @kernel
 def _bend(k, before, half, after, ramps):
-    """Lead ramp `k` through three responses at equal times.
+    """Set ramp `k` to go through three responses, equally spaced in time.
 
-    Those are on an exponential if the two halves go the same way. Otherwise the levels are crossed
-    evenly, in the half that goes the way of the whole.
+    If both halves change in the same direction, the ramp is an exponential. Otherwise the levels are crossed
+    evenly, in the half that changes in the direction of the whole.
     """
     first, second, length = half - before, after - half, ramps.length_us[k]
     ramps.base[k], ramps.ratio[k] = before, 1.0
@@ -253,7 +253,7 @@ def _bend(k, before, half, after, ramps):
         ramps.pace[k], ramps.ratio[k] = length / (after - before), second / first
     elif first * (after - before) > 0.0:
         ramps.pace[k] = 0.5 * length / first
-    elif (ramps.level[k] - before) * (after - before) <= 0.0:  # one was due before
+    elif (ramps.level[k] - before) * (after - before) <= 0.0:  # a crossing was due before the first look
         ramps.pace[k] = length / (after - before)
     else:
         ramps.base[k], ramps.pace[k] = half, 0.5 * length / second
@@ -263,7 +263,7 @@ def _bend(k, before, half, after, ramps):
 
 @kernel
 def _advance(begun, kept, watch):
-    """Move remembered levels and quiet bands of the pixels of the newest ramps."""
+    """Update the remembered levels and quiet bands of the pixels of the newest ramps."""
     model, memory, ramps, levels = watch.model, watch.memory, watch.ramps, watch.room.levels
     thresholds = model.thresholds
     for begin in range(begun, kept, BLOCK):
@@ -278,12 +278,12 @@ def _advance(begun, kept, watch):
 
 @numba.njit(cache=True, error_model="numpy")
 def events_of_ramps(watch, kept, span):
-    """EVENT array of the ramps, sorted by (t, y, x, order in the pixel).
+    """Return the EVENT array of the ramps, sorted by (t, y, x, order in the pixel).
 
     Args:
-        watch: `Watch`, whose ramps of a pixel are in the order of time.
-        kept: How many of the ramps are in use.
-        span: `Span` in which they lie.
+        watch: `Watch`, in which the ramps of each pixel are in the order of time.
+        kept: Number of ramps in use.
+        span: `Span` that contains the ramps.
     """
     ramps, height = watch.ramps, watch.memory.previous.size // watch.seen_us.size
     order, total = _row_after_row(ramps, kept, height), ramps.sent[:kept].sum()
@@ -314,7 +314,7 @@ def events_of_ramps(watch, kept, span):
 
 @numba.njit(cache=True, error_model="numpy")
 def _straighten(ramps, order, levels):
-    """Replace the levels of bent ramps by those that a line would cross at the same times."""
+    """Replace the levels of exponential ramps by the levels that a line would cross at the same times."""
     ratios, bent, event = np.empty(order.size), np.ones(levels.size), 0
     for place, j in enumerate(order):
         ratio = min(max(ramps.ratio[j], 1.0 / STEEPEST), STEEPEST)
@@ -336,7 +336,7 @@ def _straighten(ramps, order, levels):
 
 @numba.njit(cache=True, error_model="numpy")
 def _row_after_row(ramps, kept, height):
-    """Return the places of the ramps, int64 (N,), by rows of the image; within a row in their given order."""
+    """Return indices of the ramps, int64 (N,), ordered by image row; ramps of a row keep their order."""
     starts, order = np.zeros(height + 1, np.int64), np.empty(kept, np.int64)
     for j in range(kept):
         starts[ramps.pixels[j] - ramps.columns[j] * height + 1] += 1
@@ -351,7 +351,7 @@ def _row_after_row(ramps, kept, height):
 
 @numba.njit(cache=True, error_model="numpy")
 def _order_ties(events):
-    """Sort events of the same microsecond by (y, x); they come as few sorted runs, one of each look."""
+    """Sort events of the same microsecond by (y, x); they come as few sorted runs, one per look."""
     moved = np.empty(1, EVENT)
     for i in range(1, events.size):
         j = i
@@ -366,7 +366,7 @@ def _order_ties(events):
 
 @numba.njit(cache=True, error_model="numpy", inline="always")
 def _is_after(one, other):
-    """Whether an event is to come after another of the same microsecond."""
+    """Whether two events have the same time and `one` sorts after `other` by (y, x)."""
     if one.t != other.t:
         return False
     return one.y > other.y or (one.y == other.y and one.x > other.x)

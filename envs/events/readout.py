@@ -1,4 +1,4 @@
-"""From a pixel to the reader: latency, jitter, and a readout that can be full."""
+"""From a pixel to the reader: latency, jitter, and a readout of limited rate."""
 
 import numba
 import numpy as np
@@ -10,31 +10,31 @@ from envs.events.emission import EVENT
 class Readout:
     """The readout of one sensor.
 
-    With a limit, rows take turns: whenever the readout is free, the next row in which pixels wait sends the
-    events of all of them with one timestamp, and keeps it busy for as long as the limit says. A pixel that
-    waits fires no other event.
+    With a rate limit, rows take turns. Whenever the readout is free, the next row with waiting pixels sends
+    all their events with one timestamp. The readout is then busy for the time that the limit allots to these
+    events. A waiting pixel fires no other event.
     """
 
     def __init__(
         self, camera: CameraConfig, t_us: int, rng: np.random.Generator, dtype: np.dtype = EVENT
     ) -> None:
-        """Make the readout of a camera that starts at a time [us]; `rng` draws the jitter.
+        """Create the readout of a camera that starts at time `t_us` [us]; `rng` draws the jitter.
 
-        Its events are of `dtype`: EVENT, or EVENT with more fields, which stay with their event.
+        Its events have the type `dtype`: EVENT, or EVENT with more fields, which stay with their event.
         """
         self._camera, self._rng = camera, rng
         self._waiting = np.empty(0, dtype)
         self._free_us, self._row = float(t_us), 0
 
     def send(self, events: np.ndarray, t1_us: int) -> tuple[np.ndarray, int]:
-        """Return the events that leave the sensor until a time; the others wait for the next call.
+        """Return the events that leave the sensor until `t1_us`; the others wait for the next call.
 
         Args:
             events: Events of the pixels since the last call, sorted by t, at most `t1_us`.
             t1_us: The time [us].
 
         Returns:
-            Events sorted by (t, y, x), and how many were lost because their pixel was waiting.
+            Events sorted by (t, y, x), and the number of events lost because their pixel was waiting.
         """
         camera = self._camera
         if camera.latency_us > 0 or camera.latency_jitter_us > 0.0:
@@ -63,14 +63,14 @@ WAITS, LOST = -1, -2
 def take_turns(
     events: np.ndarray, t1_us: int, event_us: float, shape: tuple[int, int], state: np.ndarray
 ) -> tuple[np.ndarray, int]:
-    """When each event leaves, int64 (N,), `WAITS` or `LOST`, and how many are lost.
+    """Return the time when each event leaves, int64 (N,), `WAITS` or `LOST`, and the number of lost events.
 
     Args:
         events: EVENT sorted by t.
-        t1_us: Events that would leave later wait.
-        event_us: How long the readout is busy with one [us].
+        t1_us: Events that would leave later than this wait [us].
+        event_us: Time that the readout is busy with one event [us].
         shape: (H, W).
-        state: float64 (2,), when the readout is free [us] and the row whose turn it is; changed in place.
+        state: float64 (2,), time when the readout is free [us], and the next row; changed in place.
     """
     leaves_us, before = np.full(events.size, WAITS), np.full(events.size, -1)
     newest, waits, waiting = np.full(shape[0], -1), np.zeros(shape, np.bool_), 0

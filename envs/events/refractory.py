@@ -1,6 +1,6 @@
-"""The refractory period of a pixel after an event: what it fires then, and where it looks on from.
+"""The refractory period of a pixel after an event: the events that follow, and the level it restarts from.
 
-Input is taken as valid. `memory` is a `Memory` of `envs.events.crossings`.
+Input is assumed valid. `memory` is a `Memory` of `envs.events.crossings`.
 """
 
 from typing import NamedTuple
@@ -11,8 +11,8 @@ import numpy as np
 from envs.compiled import inlined
 from envs.events.emission import moment
 
-# Two luminances rounded to float32 leave their log difference uncertain by this much: a level
-# this near counts as reached, so that a step of exactly k thresholds gives k events.
+# Uncertainty of the log difference of two luminances rounded to float32. A level this near counts
+# as reached, so that a step of exactly k thresholds gives k events.
 TOLERANCE = 2.0**-23
 
 
@@ -23,7 +23,7 @@ class Pixel(NamedTuple):
         before, after: Responses at the last frame and at this one.
         remembered: Remembered level.
         on, off: Thresholds.
-        refractory_end_us: End of its last refractory period [us].
+        refractory_end_us: End of the pixel's last refractory period [us].
     """
 
     before: float
@@ -35,7 +35,7 @@ class Pixel(NamedTuple):
 
 
 class Motions(NamedTuple):
-    """Responses before and after of the pixels of trains, and the level remembered between, float64 (N,)."""
+    """For each train's pixel: responses at both frames and the level remembered between, float64 (N,)."""
 
     before: np.ndarray
     after: np.ndarray
@@ -44,10 +44,10 @@ class Motions(NamedTuple):
 
 @numba.njit(cache=True, error_model="numpy")
 def train_after_refractory_period(pixel, span, refractory_us):
-    """Signed crossings, start, stride, remembered level, and whether anything changed.
+    """Return signed crossings, start, stride, remembered level, and whether anything changed.
 
-    While the level moves one way at one pace, all events after the first are one refractory
-    period and one threshold apart.
+    While the response moves in one direction at one pace, two successive events are one refractory
+    period plus the time for one threshold apart.
     """
     interval = span.end_us - span.start_us
     ended, way = pixel.refractory_end_us >= span.start_us, pixel.after - pixel.before
@@ -66,9 +66,10 @@ def train_after_refractory_period(pixel, span, refractory_us):
 
 @numba.njit(cache=True, error_model="numpy")
 def start_refractory_periods(trains, motions, span, refractory_us, memory):
-    """Start the period of each last event; compact the pixels that are out of it and return how many.
+    """Start a refractory period at each pixel's last event; return how many pixels are out of theirs.
 
-    The others have no quiet band: they are decided in every frame, until their period ends.
+    These pixels are moved to the front of `trains.pixels`. The others lose their quiet band, so they are
+    decided in every frame until their period ends.
     """
     interval, free = span.end_us - span.start_us, 0
     for j in range(trains.pixels.size):
@@ -91,5 +92,5 @@ def start_refractory_periods(trains, motions, span, refractory_us, memory):
 
 @inlined
 def never_be_quiet(memory, i):
-    """Decide a pixel in every frame, until its quiet band is set again."""
+    """Make the camera decide a pixel in every frame, until its quiet band is set again."""
     memory.level_light[i], memory.quiet_low[i], memory.quiet_high[i] = -np.inf, 1.0, 0.0

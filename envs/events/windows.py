@@ -15,13 +15,14 @@ def pack_window(events: np.ndarray, start_us: int, window_us: int, capacity: int
     """Pack the events of one window into an integer array of fixed size.
 
     Row 0 is [count, dropped, window_us, 0]; rows 1 to count are [t - start_us, x, y, p], in
-    time order; the rest is 0. Beyond the capacity the newest are kept, the others counted.
+    time order; the rest is 0. If there are more events than the capacity, the oldest are
+    dropped and counted.
 
     Args:
         events: EVENT with t in (start_us, start_us + window_us], sorted by t.
         start_us: Start of the window [us].
-        window_us: Its length [us].
-        capacity: Most events that it holds.
+        window_us: Length of the window [us].
+        capacity: Largest number of events in the window.
 
     Returns:
         int32 (capacity + 1, 4).
@@ -49,14 +50,14 @@ def pack_window(events: np.ndarray, start_us: int, window_us: int, capacity: int
 def pack_windows(
     events: np.ndarray, ends: np.ndarray, starts_us: np.ndarray, lengths_us: np.ndarray, capacity: int | None
 ) -> np.ndarray | tuple[np.ndarray, ...]:
-    """Several windows, each as by `pack_window`, of events that are known to be valid.
+    """Pack several windows as `pack_window` does, without checking the events.
 
     Args:
-        events: EVENT of all windows, one after the other, such as those of `EventCamera`.
+        events: Valid EVENT of all windows, one after the other, such as the events of `EventCamera`.
         ends: int64 (B + 1,), window b has events ends[b] .. ends[b + 1] - 1.
-        starts_us: Where each window starts, int64 (B,) [us].
-        lengths_us: How long it is, int64 (B,) [us].
-        capacity: Most events that a window holds; None: each has as many rows as it needs.
+        starts_us: Start of each window, int64 (B,) [us].
+        lengths_us: Length of each window, int64 (B,) [us].
+        capacity: Largest number of events in a window; None: each window has as many rows as it needs.
 
     Returns:
         int32 (B, capacity + 1, 4), or B arrays (N + 1, 4).
@@ -76,7 +77,7 @@ def unpack_window(window: np.ndarray) -> tuple[np.ndarray, int]:
     """Return the events of a packed window, with t counted from its start, and the window's length [us].
 
     Args:
-        window: int32 (capacity + 1, 4), as `pack_window` makes it.
+        window: int32 (capacity + 1, 4), from `pack_window`.
 
     Raises:
         ValueError: Wrong dtype or shape, or a count that the rows cannot hold.
@@ -93,12 +94,12 @@ def unpack_window(window: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 def event_image(events: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Picture of events: 255 where the last one was ON, 125 where it was OFF, else 0 (appendix D.1.2).
+    """Draw a picture of events: 255 if a pixel's last event was ON, 125 if OFF, else 0 (appendix D.1.2).
 
     Args:
         events: EVENT in time order.
-        width: Pixels.
-        height: Pixels.
+        width: Width of the picture [pixels].
+        height: Height of the picture [pixels].
 
     Returns:
         uint8 (H, W).
@@ -115,7 +116,7 @@ def event_image(events: np.ndarray, width: int, height: int) -> np.ndarray:
 
 @numba.njit(cache=True, error_model="numpy")
 def _first_out_of_place(events, start_us, window_us):
-    """Index of the first event that is out of time or order or has no polarity, or -1."""
+    """Return the index of the first event outside the window, out of order or without polarity, or -1."""
     last = start_us + 1
     for i in range(events.size):
         event = events[i]
@@ -127,7 +128,7 @@ def _first_out_of_place(events, start_us, window_us):
 
 @numba.njit(cache=True, error_model="numpy")
 def _fill(events, start_us, window_us, window):
-    """Write the newest events, and the numbers of row 0, into an empty window."""
+    """Write the newest events and row 0 into an empty window."""
     dropped = max(events.size - (window.shape[0] - 1), 0)
     window[0, 0], window[0, 1], window[0, 2] = events.size - dropped, dropped, window_us
     for i in range(dropped, events.size):
@@ -145,7 +146,7 @@ def _fill_all(events, ends, starts_us, lengths_us, windows):
 
 @numba.njit(cache=True, error_model="numpy")
 def _fill_flat(events, ends, starts_us, lengths_us, rows):
-    """Fill windows of just the length that each needs, one after the other."""
+    """Fill windows that have just as many rows as they need, one after the other."""
     for b in range(starts_us.size):
         own = rows[ends[b] + b : ends[b + 1] + b + 1]
         own[0, 3] = 0

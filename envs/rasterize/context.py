@@ -1,10 +1,10 @@
-"""The OpenGL context of the rasteriser and its drawing: headless, linear, in float32.
+"""The OpenGL context and the drawing of the rasteriser: headless, linear, in float32.
 
-pyrender holds only the context: it opens EGL, uploads vertices, links shader programs and keeps
-the camera. What it would draw with is replaced here by subclasses: its shaders, framebuffers,
-materials, lights and draw loop. They override private methods, so pyrender is pinned to one version.
+pyrender provides only the context: it opens EGL, uploads vertices, links shader programs and stores
+the camera. Subclasses here replace its shaders, framebuffers, materials, lights and draw loop. They
+override private methods, so pyrender is pinned to one version.
 
-Importing this loads OpenGL; only `envs.rasterize.renderer` does, when a renderer is made.
+Importing this module loads OpenGL. Only `envs.rasterize.renderer` imports it, when a renderer is created.
 """
 
 import contextlib
@@ -27,20 +27,20 @@ from pyrender.shader_program import ShaderProgram
 from envs.rasterize.shaders import FRAGMENT, VERTEX, source
 from envs.scene.textures import noise_tile
 
-# PyPI's torch with CUDA brings triton, whose import crashes once Mesa has loaded its own LLVM.
+# PyPI's torch with CUDA includes triton, whose import crashes after Mesa has loaded its own LLVM.
 if importlib.util.find_spec("triton"):
     importlib.import_module("triton")
-# From Python 3.12 on the type of ctypes.byref has a name that PyOpenGL 3.1.0, which pyrender pins, lacks.
+# Since Python 3.12 the type of ctypes.byref has a name that PyOpenGL 3.1.0 (pinned by pyrender) lacks.
 FormatHandler("byref", "OpenGL.arrays.ctypesparameters.CtypesParameterHandler", ["_ctypes.CArgObject"])
-EGL = egl.egl  # imported before pyrender, OpenGL.EGL breaks the import of OpenGL.GL.shaders
+EGL = egl.egl  # importing OpenGL.EGL before pyrender would break the import of OpenGL.GL.shaders
 MULTISAMPLES = 4
 
 
 def start(width: int, height: int, antialias: bool) -> tuple["Platform", "LuminanceRenderer"]:
-    """Open a context of its own and a renderer in it, for images of `width` x `height` pixels.
+    """Open a new context and a renderer in it, for images of `width` x `height` pixels.
 
     Raises:
-        Exception: Whatever EGL, OpenGL or a missing library raises; the renderer names the packages.
+        Exception: Any error of EGL, OpenGL or a missing library; the renderer names the packages.
     """
     device = egl.get_device_by_index(int(os.environ.get("EGL_DEVICE_ID", "0")))
     platform = Platform(width, height, device=device)
@@ -54,7 +54,7 @@ def start(width: int, height: int, antialias: bool) -> tuple["Platform", "Lumina
 
 
 class Platform(egl.EGLPlatform):
-    """pyrender's EGL platform, in which several contexts can live side by side."""
+    """pyrender's EGL platform, extended to several contexts at once."""
 
     _egl_display: Any
     _egl_context: Any
@@ -65,7 +65,7 @@ class Platform(egl.EGLPlatform):
             EGL.eglMakeCurrent(self._egl_display, EGL.EGL_NO_SURFACE, EGL.EGL_NO_SURFACE, EGL.EGL_NO_CONTEXT)
 
     def delete_context(self) -> None:
-        """Delete the context without eglTerminate, which would end all other renderers of the display."""
+        """Delete the context without eglTerminate, which would stop all other renderers of the display."""
         if self._egl_context is not None:
             self.make_uncurrent()
             EGL.eglDestroyContext(self._egl_display, self._egl_context)
@@ -73,9 +73,10 @@ class Platform(egl.EGLPlatform):
 
     @contextlib.contextmanager
     def current(self) -> Iterator[None]:
-        """Hold the context only while drawing, so that another thread may; RuntimeError if OpenGL fails.
+        """Make the context current only while drawing, so that other threads can use it.
 
-        OpenGL's own errors cannot be pickled, so that a worker could not report them.
+        Raises RuntimeError if OpenGL fails, because OpenGL's own errors cannot be pickled, so a worker could
+        not report them.
         """
         try:
             self.make_current()
@@ -88,7 +89,7 @@ class Platform(egl.EGLPlatform):
 
 
 class Program(ShaderProgram):
-    """pyrender's shader program, made from source text instead of files; its uniforms are in block 0."""
+    """pyrender's shader program, built from source text instead of files; its uniforms are in block 0."""
 
     def __init__(self, surface: int, pattern: int) -> None:
         """Compile and link in the current context."""
@@ -103,15 +104,15 @@ class Program(ShaderProgram):
 class Camera(PerspectiveCamera):
     """pyrender's pinhole camera without a far plane, half a step of the rasteriser's grid to the right.
 
-    A rasteriser rounds corners to a grid of 2^-bits pixels, and counts a sample that lies on an
-    edge to its right. So an edge less than half a step to the right of a sample would be drawn
-    on its left; with this, the rounding and the rule agree.
+    A rasteriser rounds corners to a grid of 2^-bits pixels, and a sample exactly on an edge counts as
+    right of the edge. So an edge less than half a step to the right of a sample would be drawn on the
+    sample's left. The shift by half a step makes the rounding agree with this rule.
     """
 
     _matrix: np.ndarray | None = None
 
     def get_projection_matrix(self, width: int | None = None, height: int | None = None) -> np.ndarray:
-        """(4, 4) from the camera's frame to the clip space, for an image of `width` pixels."""
+        """Return the matrix (4, 4) from the camera's frame to clip space, for an image of `width` pixels."""
         if self._matrix is None:
             self._matrix = super().get_projection_matrix(width, height)
             self._matrix[0, 2] -= 2.0 ** -GL.glGetIntegerv(GL.GL_SUBPIXEL_BITS) / width
@@ -123,8 +124,8 @@ class Draw(NamedTuple):
 
     Attributes:
         program: Surface and pattern, as in `shaders.source`.
-        runs: (R, 2) first and last + 1 of the faces.
-        noise: Its seed; None if there is no noise.
+        runs: (R, 2), first and last + 1 face of each run.
+        noise: Seed of the noise; None: no noise.
     """
 
     program: tuple[int, int]
@@ -133,33 +134,33 @@ class Draw(NamedTuple):
 
 
 class LuminanceRenderer(Renderer):
-    """Draws into one float channel, multisampled or not, with the shaders of this package.
+    """Renderer into one float channel, multisampled or not, with the shaders of this package.
 
-    Of pyrender's renderer only the upload of vertices is left. The context is not shared, so
-    state that never changes is set once.
+    It uses only the vertex upload of pyrender's renderer. The context is not shared, so state
+    that never changes is set once.
     """
 
     def __init__(self, width: int, height: int, antialias: bool) -> None:
-        """Make the framebuffers, of `width` x `height` pixels, in the current context."""
+        """Create the framebuffers, of `width` x `height` pixels, in the current context."""
         super().__init__(width, height)
         size = (width, height)
         self._main_fb_ms, self._main_cb_ms, self._main_db_ms = _framebuffer(size, MULTISAMPLES * antialias)
         self._main_fb, self._main_cb, self._main_db = _framebuffer(size, 0)
         self._main_fb_dims = size
         self._programs: dict[tuple[int, int], Program] = {}
-        self._tiles: dict[int, int] = {}  # by the seed of the noise
+        self._tiles: dict[int, int] = {}  # seed of the noise -> texture
         self._block = GL.glGenBuffers(1)
         GL.glBindBufferBase(GL.GL_UNIFORM_BUFFER, 0, self._block)
-        # Nothing is too near to be seen.
+        # The depth clamp draws surfaces nearer than the near plane, too.
         for state in (GL.GL_DEPTH_TEST, GL.GL_CULL_FACE, GL.GL_DEPTH_CLAMP, GL.GL_MULTISAMPLE):
             GL.glEnable(state)
         GL.glViewport(0, 0, width, height)
-        # Of the next frame: what to draw, in this order, and the uniforms, one record.
+        # For the next frame: the draw calls in order, and the uniforms, one record.
         self.draws: list[Draw] = []
         self.frame = np.zeros(0)
 
     def use(self, draws: list[Draw], sky: float) -> None:
-        """Prepare for a scene: compile missing programs and upload its noise."""
+        """Prepare for a scene: compile missing programs and upload the scene's noise."""
         GL.glClearColor(sky, sky, sky, 1.0)
         self._drop_tiles()
         for draw in draws:
@@ -170,7 +171,7 @@ class LuminanceRenderer(Renderer):
         self.draws = draws
 
     def delete(self) -> None:
-        """Free all objects of OpenGL."""
+        """Free all OpenGL objects."""
         for program in self._programs.values():
             program.delete()
         self._programs.clear()
@@ -179,7 +180,7 @@ class LuminanceRenderer(Renderer):
         super().delete()
 
     def __del__(self) -> None:
-        """Do nothing: pyrender would free its objects in whatever context is current then."""
+        """Do nothing; pyrender would free its objects in whatever context is current."""
 
     def _drop_tiles(self) -> None:
         for texture in self._tiles.values():
@@ -187,7 +188,7 @@ class LuminanceRenderer(Renderer):
         self._tiles.clear()
 
     def _forward_pass(self, scene: Any, flags: int, seg_node_map: Any = None) -> np.ndarray:
-        """Draw the frame: replaces pyrender's loop over nodes, materials and lights."""
+        """Draw the frame; this replaces pyrender's loop over nodes, materials and lights."""
         GL.glBindFramebuffer(GL.GL_FRAMEBUFFER, self._main_fb_ms)
         GL.glClear(GL.GL_COLOR_BUFFER_BIT | GL.GL_DEPTH_BUFFER_BIT)
         GL.glBufferData(GL.GL_UNIFORM_BUFFER, self.frame.nbytes, self.frame, GL.GL_STREAM_DRAW)
@@ -204,7 +205,7 @@ class LuminanceRenderer(Renderer):
         return self._read_main_framebuffer(scene, flags)
 
     def _read_main_framebuffer(self, _scene: Any, _flags: int) -> np.ndarray:
-        """(H, W) float32, row 0 at the bottom; resolves the multisamples first."""
+        """Resolve the multisamples and return the image, (H, W) float32, row 0 at the bottom."""
         width, height = self._main_fb_dims
         box = (0, 0, width, height)
         GL.glBindFramebuffer(GL.GL_READ_FRAMEBUFFER, self._main_fb_ms)
@@ -217,7 +218,7 @@ class LuminanceRenderer(Renderer):
 
 
 def _framebuffer(size: tuple[int, int], multisamples: int) -> tuple[int, int, int]:
-    """Make a framebuffer with a float colour buffer and a depth buffer of `size` (width, height)."""
+    """Create a framebuffer with a float colour buffer and a depth buffer of `size` (width, height)."""
     color, depth = GL.glGenRenderbuffers(2)
     frame = GL.glGenFramebuffers(1)
     GL.glBindFramebuffer(GL.GL_FRAMEBUFFER, frame)
@@ -234,7 +235,7 @@ def _framebuffer(size: tuple[int, int], multisamples: int) -> tuple[int, int, in
 
 
 def _float_texture(texels: np.ndarray) -> int:
-    """Make a texture of one float channel that repeats, bilinear between its texels."""
+    """Create a repeating texture of one float channel, bilinear between texels."""
     texture = GL.glGenTextures(1)
     GL.glBindTexture(GL.GL_TEXTURE_2D, texture)
     GL.glTexParameteri(GL.GL_TEXTURE_2D, GL.GL_TEXTURE_MIN_FILTER, GL.GL_LINEAR)

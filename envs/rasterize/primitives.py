@@ -1,7 +1,7 @@
 """A scene as vertices and triangles for the shaders of `envs.rasterize.shaders`.
 
 Flat faces, the ground, the walls and a scene's own mesh are as in `envs.scene.triangles`. A round
-body is a few rings of corners around its centre, which the vertex shader turns towards the camera.
+body is a few rings of corners around its centre; the vertex shader turns them towards the camera.
 """
 
 from typing import TYPE_CHECKING, NamedTuple
@@ -16,7 +16,7 @@ from envs.scene.triangles import Part, box_mesh, ground_mesh, wall_meshes
 if TYPE_CHECKING:
     from envs.scene import Scene
 
-# The attributes of `shaders.VERTEX`, in their order.
+# The attributes of `shaders.VERTEX`, in the same order.
 VERTEX = np.dtype(
     [
         ("position", "f4", 3),
@@ -29,7 +29,7 @@ VERTEX = np.dtype(
 
 
 class Piece(NamedTuple):
-    """Triangles of one kind of surface: of the obstacle `body`, or -1 of none."""
+    """Triangles of one kind of surface, of obstacle number `body`; -1: of no obstacle."""
 
     surface: int
     body: int
@@ -38,12 +38,12 @@ class Piece(NamedTuple):
 
 
 class Batch(NamedTuple):
-    """Faces that follow each other and are of one kind of surface.
+    """Consecutive faces of one kind of surface.
 
     Attributes:
-        surface: Which, one of `shaders.SURFACES`.
-        bodies: (N,) the obstacles whose faces follow each other; -1: of no obstacle.
-        first: (N + 1,) first face of each, and the first that is not of the batch.
+        surface: Kind of surface, an index in `shaders.SURFACES`.
+        bodies: (N,) the obstacles of the faces, in order; -1: no obstacle.
+        first: (N + 1,) first face of each obstacle, and the first face after the batch.
     """
 
     surface: int
@@ -57,7 +57,7 @@ class Drawing(NamedTuple):
     Attributes:
         vertices: (V,) VERTEX.
         faces: (F, 3) int64.
-        batches: In the order in which to draw them.
+        batches: Batches in the order of drawing.
     """
 
     vertices: np.ndarray
@@ -69,7 +69,7 @@ def draw(scene: "Scene") -> Drawing:
     """Return the triangles of `scene`."""
     bodies = scene.obstacles
     pieces: list[Piece] = []
-    standing = bodies["z"] <= bodies["rz"]  # their undersides cannot be seen
+    standing = bodies["z"] <= bodies["rz"]  # their undersides are hidden
     for kind in (POLE, CONE, ELLIPSOID):
         for on_ground in (True, False):
             found = np.flatnonzero((bodies["kind"] == kind) & (standing == on_ground))
@@ -85,7 +85,7 @@ def draw(scene: "Scene") -> Drawing:
 
 
 def _join(pieces: list[Piece]) -> Drawing:
-    """Join pieces, sorted by surface, to one drawing."""
+    """Join pieces, sorted by surface, into one drawing."""
     offsets = np.cumsum([0] + [len(piece.vertices) for piece in pieces])
     first = np.cumsum([0] + [len(piece.faces) for piece in pieces])
     surfaces = np.array([piece.surface for piece in pieces])
@@ -99,7 +99,7 @@ def _join(pieces: list[Piece]) -> Drawing:
 
 
 def repeat_m(texture: Texture) -> float:
-    """Return after how many metres `texture` repeats along either axis."""
+    """Return the distance after which `texture` repeats along each axis [m]."""
     return texture.period_m * (TILE_PERIODS if texture.pattern == "noise" else 1)
 
 
@@ -146,7 +146,7 @@ def _vertices(scene: "Scene", kind: int, bodies: np.ndarray, corners: np.ndarray
 
 
 def _templates(kind: int, underside: bool) -> list[tuple[int, np.ndarray, np.ndarray]]:
-    """Surfaces of a body: kind; corners (V, 3) as number, radius, height, of 1 at most; faces (F, 3)."""
+    """Return a body's surfaces: kind; corners (V, 3) as number, radius and height <= 1; faces (F, 3)."""
     if kind == ELLIPSOID:
         return [(DISC, _ring(np.arange(OUTLINE), 1.0, 0.0), _polygon(OUTLINE, up=True))]
     corner, i, j = np.arange(RING) - RING // 2, np.arange(RING), (np.arange(RING) + 1) % RING
@@ -169,8 +169,8 @@ def _ring(corner: np.ndarray, radius: float, height: float) -> np.ndarray:
 def _polygon(corners: int, up: bool) -> np.ndarray:
     """Return the triangles of a convex polygon whose corners are numbered counter-clockwise from above.
 
-    Every second corner is cut off, then every second one of what is left: few thin triangles,
-    which cost most.
+    It cuts off every second corner, then every second corner of the rest, and so on. This gives few thin
+    triangles, which cost most.
     """
     left, faces = np.arange(corners), []
     while len(left) > 2:

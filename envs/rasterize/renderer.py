@@ -1,14 +1,14 @@
-"""OpenGL renderer for everything that a scene can hold: same interface and luminance as the ray caster.
+"""OpenGL renderer for every scene without moving bodies: same interface and luminance as the ray caster.
 
-Headless EGL, one draw call per kind of surface with the shaders of `envs.rasterize.shaders`, read
-back from a 32-bit float framebuffer: linear, without gamma, not rounded to 8 bits. pyrender holds
-only the OpenGL context; `envs.rasterize.context` says what is replaced in it. OpenGL is not
-imported before a renderer is made. A renderer belongs to the process that made it; it may be
+It uses headless EGL and one draw call per kind of surface with the shaders of `envs.rasterize.shaders`.
+The image is read back from a 32-bit float framebuffer: linear, without gamma, not rounded to 8 bits.
+pyrender only provides the OpenGL context; `envs.rasterize.context` replaces the rest of it. OpenGL is
+imported when the first renderer is created. A renderer belongs to the process that created it; it may be
 used from any thread, one at a time.
 
-At the same sample points the picture equals that of `tests.support.point_samples` but for the edges,
-which a rasteriser rounds to 1/256 pixel, and for the polygons that stand for the rims of poles
-and the outlines of ellipsoids. `raycast` says what is seen from where.
+At the same sample points the picture equals `tests.support.point_samples`, except at edges, which a
+rasteriser rounds to 1/256 pixel, and at the polygons that replace the rims of poles and the outlines of
+ellipsoids. `envs.raycast.renderer` states which sides of a surface are visible.
 """
 
 import contextlib
@@ -25,7 +25,7 @@ from envs.rasterize.shaders import TEXTURE_OF
 from envs.scene import BOX, Scene, Texture
 from envs.scene.textures import PATTERNS
 
-MIN_DEPTH_M = 0.02  # nothing nearer is drawn
+MIN_DEPTH_M = 0.02  # near plane; by GL_DEPTH_CLAMP nearer surfaces are drawn too
 # The uniforms of a frame, as the shaders expect them in memory.
 FRAME = np.dtype(
     [
@@ -44,7 +44,7 @@ PACKAGES = "apt-get install --no-install-recommends libegl1 libgl1 libgl1-mesa-d
 
 
 class PyrenderRenderer:
-    """Renders one scene after the other; owns an OpenGL context until `close`."""
+    """Renderer of one scene at a time; owns an OpenGL context until `close`."""
 
     def __init__(
         self,
@@ -55,21 +55,21 @@ class PyrenderRenderer:
         samples: int = 2,
         cull_m: float = math.inf,
     ) -> None:
-        """Create a renderer of `width` x `height` pixels and `fov_deg` across.
+        """Create a renderer of `width` x `height` pixels with a horizontal field of view of `fov_deg`.
 
         Args:
-            scene: What to draw.
+            scene: The scene to draw.
             width: Columns of the image.
             height: Rows of the image.
             fov_deg: Horizontal field of view [degrees]; pixels are square.
             samples: 1: one sample at each pixel centre, no anti-aliasing. n > 1: n x n
-                sub-pixels of 4 multisamples each, averaged; 2 gives 16 samples a pixel at
-                edges, and 4 inside of surfaces, which matters for textures.
-            cull_m: Obstacles whose upright cylinder or box begins farther away are not drawn [m].
+                sub-pixels of 4 multisamples each, averaged; 2 gives 16 samples per pixel at
+                edges, and 4 inside surfaces, which matters for textures.
+            cull_m: Obstacles are not drawn if their upright cylinder or box is farther away [m].
 
         Raises:
-            ValueError: If a size is not at least 1, fov_deg not in [1, 170], or cull_m not > 0.
-            RuntimeError: If EGL or a system library it needs is missing; names the packages.
+            ValueError: A size is not at least 1, fov_deg not in [1, 170], or cull_m not > 0.
+            RuntimeError: EGL or a system library that it needs is missing; names the packages.
         """
         check_image(width, height, fov_deg, samples, cull_m)
         self.width, self.height, self.samples, self.cull_m = width, height, samples, cull_m
@@ -121,8 +121,8 @@ class PyrenderRenderer:
             (height, width) float32 linear luminance, row 0 on top.
 
         Raises:
-            ValueError: If the pose or the time is not finite or too large, or below the ground.
-            RuntimeError: If OpenGL fails, or the renderer was closed.
+            ValueError: The pose or the time is not finite or too large, or the pose is below the ground.
+            RuntimeError: OpenGL fails, or the renderer was closed.
         """
         check_pose((x_m, y_m, z_m, yaw_rad), t_s)
         if self._renderer is None:
@@ -140,7 +140,7 @@ class PyrenderRenderer:
         return _mean_of_blocks(fine, self.samples)[::-1].copy()
 
     def _set_frame(self, pose: np.ndarray, t_s: float) -> None:
-        """Write the uniforms of a pose. Whole repeats of textures are left out, so that float32 is enough."""
+        """Set the uniforms of a pose; subtract whole repeats of textures, so that float32 is enough."""
         frame = self._renderer.frame
         view = np.eye(4)
         view[:3, :3] = pose[:3, :3].T
@@ -152,8 +152,8 @@ class PyrenderRenderer:
                 frame["moved"][i, :2] = [v * t_s % repeat for v in texture.velocity_mps]
 
     def _cull(self, eye_m: np.ndarray) -> None:
-        """Draw only obstacles within `cull_m`, and everything that is no obstacle."""
-        near = np.append(_distances(self._bodies, eye_m) <= self.cull_m, True)  # the last: of no obstacle
+        """Draw only the obstacles within `cull_m`, and everything that is not an obstacle."""
+        near = np.append(_distances(self._bodies, eye_m) <= self.cull_m, True)  # index -1: no obstacle
         for i, batch in enumerate(self._batches):
             self._renderer.draws[i] = self._renderer.draws[i]._replace(runs=_runs(batch, near))
 
@@ -162,7 +162,7 @@ class PyrenderRenderer:
         return np.stack([self.render(*pose) for pose in poses.tolist()])
 
     def close(self) -> None:
-        """Free the OpenGL context; other renderers are not affected. Closing twice is allowed."""
+        """Free the OpenGL context, without effect on other renderers. Closing twice is allowed."""
         if getattr(self, "_renderer", None) is None:
             return
         with self._platform.current():
@@ -171,7 +171,7 @@ class PyrenderRenderer:
         self._renderer = None
 
     def __del__(self) -> None:
-        """Close."""
+        """Free the OpenGL context, ignoring errors."""
         with contextlib.suppress(Exception):
             self.close()
 
@@ -180,9 +180,9 @@ def _start(width: int, height: int, antialias: bool) -> tuple[Any, Any]:
     """Start the EGL platform and a renderer with a float framebuffer, or raise RuntimeError in one line."""
     os.environ["PYOPENGL_PLATFORM"] = "egl"
     os.environ.setdefault("PYGLET_HEADLESS", "1")
-    # llvmpipe's own threads hang a forked child.
+    # llvmpipe's own threads would make a forked child hang.
     os.environ.setdefault("LP_NUM_THREADS", "0")
-    # pyrender still uses the name that numpy 2 removed.
+    # pyrender still uses this name, which numpy 2 removed.
     if not hasattr(np, "infty"):
         np.infty = np.inf  # type: ignore[attr-defined]  # noqa: NPY201
     try:
@@ -233,7 +233,7 @@ def _draw(batch: Batch, textures: tuple[Texture, ...]) -> Any:
 
 
 def _runs(batch: Batch, near: np.ndarray) -> np.ndarray:
-    """Return (R, 2) first and last + 1 face of the bodies that are `near`; neighbours share a run."""
+    """Return (R, 2), first and last + 1 face of each run of bodies that are `near`."""
     drawn = np.concatenate([[False], near[batch.bodies], [False]])
     return batch.first[np.flatnonzero(drawn[1:] != drawn[:-1]).reshape(-1, 2)]
 

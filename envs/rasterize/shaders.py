@@ -2,26 +2,26 @@
 
 A round body is drawn as few triangles that face the camera. The vertex shader turns every
 ring of a pole or a cone so that two of its corners lie where the line of sight touches the
-body, and draws an ellipsoid as the disc of those points; the fragment shader takes the line
-of sight on to the surface x^2 + y^2 = A + B z + C z^2 around the centre of the body, and
-shades that point. Flat faces are drawn as they are. Surface coordinates of textures come
-from the line of sight as well, not from interpolation, which is too coarse far away.
+body. It draws an ellipsoid as the disc bounded by those points. The fragment shader extends
+the line of sight to the surface x^2 + y^2 = A + B z + C z^2 around the centre of the body, and
+shades that point. Flat faces are drawn unchanged. Surface coordinates of textures are computed
+from the line of sight as well, because interpolation is too coarse far away.
 
-Every kind of surface with every pattern has a program of its own: in software a fragment pays
-for both sides of a branch. Small triangles cost most, so corners that nobody would see apart
-fall together.
+Every kind of surface with every pattern has its own program, because software rendering pays
+for both sides of a branch. Small triangles cost most, so corners too close to be told apart
+are merged.
 """
 
 from envs.scene.textures import PATTERNS, TILE, TILE_PERIODS
 
-# Kinds of surfaces, in the order in which they are drawn: what hides most first, so that less
-# is shaded twice. SIDE and DISC are round, RIM is a level face of a round body.
+# Kinds of surfaces in the order of drawing: those that hide most come first, so that less is
+# shaded twice. SIDE and DISC are round, RIM is a level face of a round body.
 SURFACES = ("side", "disc", "face", "rim", "mesh", "wall", "ground")
 SIDE, DISC, FACE, RIM, MESH, WALL, GROUND = range(7)
-# The texture of each kind, as a place among those of ground, walls and obstacles; a mesh has none.
+# The texture of each kind: 0 ground, 1 walls, 2 obstacles; a mesh has none.
 TEXTURE_OF = (2, 2, 2, 2, None, 1, 0)
 
-# Corners of a ring and of an ellipsoid's outline, at most. Sides and outlines of poles and
+# Largest number of corners of a ring and of an ellipsoid's outline. Sides and outlines of poles and
 # cones are exact with any number; the rims of poles and the outlines of ellipsoids are polygons.
 RING, OUTLINE = 24, 48
 
@@ -30,7 +30,7 @@ _HEAD = f"""#version 330 core
 const float QUARTER = {RING // 4}.0, OUTLINE = {OUTLINE}.0, TILE = {TILE}.0, TILE_PERIODS = {TILE_PERIODS}.0;
 """
 
-# The same for all programs; `envs.rasterize.renderer.FRAME` is its memory.
+# The same for all programs; `envs.rasterize.renderer.FRAME` has its memory layout.
 _FRAME = """
 layout(std140, row_major) uniform Frame {
     mat4 clip;       // from directions of the world, as seen from the camera, to clip space

@@ -2,8 +2,8 @@
 
 The camera only yaws, so a column is an upright plane through the eye, in which every body is
 convex: a rectangle, an ellipse, or the piece of a hyperbola above a cone's base. Along slope
-u = right / forward a point at depth d lies at d * u to the right; a point at height z shows in
-row horizon + focal * (eye - z) / d. Input is assumed valid.
+u = right / forward a point at depth d lies at d * u to the right; a point at height z appears
+in row horizon + focal * (eye - z) / d. Input is assumed valid.
 """
 
 import math
@@ -17,10 +17,10 @@ from envs.scene import BOX, CONE, ELLIPSOID, POLE
 
 MIN_DEPTH = 1e-9  # [m]; so that a division is always defined
 MIN_BEND = 1e-3  # an outline that bends less is integrated as a parabola
-MAX_BULGE = 1e4  # [rows] an arc that bulges more is not seen
+MAX_BULGE = 1e4  # [rows] an arc that bulges more is invisible
 OUTSIDE = 1e7  # [rows] far outside of any image
-SURELY = 1.0 + 1e-9  # a ratio of squares that no rounding of distances brings about
-WIDE = 2.0  # [pixels] a body that bends and is wider may hide others
+SURELY = 1.0 + 1e-9  # factor on squared distances that exceeds all rounding errors
+WIDE = 2.0  # [pixels] only curved bodies wider than this are tested for hiding other bodies
 
 
 class Section(NamedTuple):
@@ -41,13 +41,13 @@ def see_bodies(
     Args:
         bodies: (N,) BODY.
         frame: FRAME record.
-        low: Slope of the left end of what is looked at.
-        high: Slope of its right end.
+        low: Slope of the left end of the view.
+        high: Slope of the right end of the view.
         cull: Bodies farther away are left out [m].
         seen: (N,) BODY, whose first elements become the bodies in view.
 
     Returns:
-        How many are in view.
+        The number of bodies in view.
     """
     slack_low, slack_high = math.sqrt(1.0 + low * low), math.sqrt(1.0 + high * high)
     count = 0
@@ -78,17 +78,17 @@ def see_bodies(
 
 @kernel
 def drop_hidden(seen: np.ndarray, count: int, frame: Record) -> int:
-    """Leave out bodies behind a cone or an ellipsoid, which would only cut it into more strips.
+    """Leave out bodies hidden behind a cone or an ellipsoid, which would only cut it into more strips.
 
-    A body is convex, and so is its image: it hides all between four corners that it hides.
+    A body is convex, and so is its image. A body that hides four corners also hides everything between them.
 
     Args:
-        seen: (N,) BODY, of which the first `count` are in view.
-        count: How many.
+        seen: (N,) BODY, of which the first `count` are in view; the remaining bodies keep their order.
+        count: Number of bodies in view.
         frame: FRAME record.
 
     Returns:
-        How many are left, in the same order.
+        The number of remaining bodies.
     """
     for k in range(count):
         one = seen[k]
@@ -106,7 +106,7 @@ def drop_hidden(seen: np.ndarray, count: int, frame: Record) -> int:
 
 @kernel
 def _mark_hidden(seen: np.ndarray, one: Record, frame: Record) -> None:
-    """Mark the bodies that `one` hides by a right silhouette at minus infinity."""
+    """Mark each body that `one` hides by setting its right silhouette to minus infinity."""
     for i in range(len(seen)):
         other = seen[i]
         if one.low < other.low < other.high < one.high and _hides(one, other, frame):
@@ -115,7 +115,7 @@ def _mark_hidden(seen: np.ndarray, one: Record, frame: Record) -> None:
 
 @kernel
 def _hides(one: Record, other: Record, frame: Record) -> bool:
-    """Whether a body hides another body whose silhouettes lie within its own."""
+    """Whether body `one` hides body `other`, whose silhouettes lie within those of `one`."""
     near = other.forward - math.hypot(other.rx, other.ry)
     if near <= MIN_DEPTH or not is_before(one, other, frame, 0.5 * (other.low + other.high)):
         return False
@@ -139,9 +139,10 @@ def put_at(body: Record, time: float) -> None:
 
 @kernel
 def silhouette_of(body: Record, frame: Record) -> tuple[float, float]:
-    """Return the slopes of the left and right silhouette of a body, in view or not; +-inf as for a circle.
+    """Return the slopes of the left and right silhouette of a body, in view or not.
 
-    Notes in the body where it is as seen from the eye.
+    A slope is +-inf under the same conditions as for `_round_silhouette`. The function stores the body's
+    position relative to the eye in the body.
     """
     if body.moves:
         put_at(body, frame.time)
@@ -158,9 +159,9 @@ def _silhouette(body: Record, frame: Record) -> tuple[float, float]:
 
 @kernel
 def _is_outside(body: Record, eye_z: float, cull: float) -> bool:
-    """Whether the eye is outside the body, which is invisible from within, and at most `cull` away."""
+    """Whether the eye is outside the body (which is invisible from inside) and at most `cull` [m] away."""
     distance, above = 0.0, max(0.0, eye_z - body.top, body.bottom - eye_z)
-    if body.kind != BOX and above == 0.0:  # mostly it is clear without roots
+    if body.kind != BOX and above == 0.0:  # in most cases the squares decide without roots
         square, reach = body.right * body.right + body.forward * body.forward, cull + body.rx
         if square > SURELY * body.rx * body.rx and SURELY * square < reach * reach:
             return True
@@ -202,7 +203,7 @@ def _round_silhouette(body: Record) -> tuple[float, float]:
 
 @kernel
 def corner(body: Record, frame: Record, k: int) -> tuple[float, float]:
-    """Return right and forward of the k-th corner of a box's footprint, in order around it [m]."""
+    """Return right and forward of the k-th corner of a box's footprint [m]; corners go around the box."""
     dx = body.dx + (body.rx if k == 1 or k == 2 else -body.rx)
     dy = body.dy + (body.ry if k == 2 or k == 3 else -body.ry)
     return dx * frame.cos + dy * frame.sin, dy * frame.cos - dx * frame.sin
@@ -210,7 +211,7 @@ def corner(body: Record, frame: Record, k: int) -> tuple[float, float]:
 
 @kernel
 def _box_silhouette(body: Record, frame: Record) -> tuple[float, float]:
-    """Return the slopes of the left and right silhouette of a rectangle; +-inf as for a circle."""
+    """Return the slopes of the left and right silhouette of a rectangle; +-inf as in `_round_silhouette`."""
     if abs(body.dx) <= body.rx and abs(body.dy) <= body.ry:
         return -math.inf, math.inf
     low, high = math.inf, -math.inf
@@ -221,7 +222,7 @@ def _box_silhouette(body: Record, frame: Record) -> tuple[float, float]:
         if forward > 0.0:
             low, high = min(low, right / forward), max(high, right / forward)
         if (forward > 0.0) != (behind > 0.0):
-            # The side crosses the plane through the eye: there it is seen at any slope.
+            # The side crosses the plane through the eye, where slopes become infinite.
             crossing = (before * forward - behind * right) / (forward - behind)
             low, high = (low, math.inf) if crossing > 0.0 else (-math.inf, high)
     return low, high
@@ -251,7 +252,7 @@ def depths(body: Record, frame: Record, u: float) -> tuple[float, float]:
 
 @inlined
 def root(body: Record, u: float) -> float:
-    """Return half of the chord that slope `u` cuts from a circle, in radii, times sqrt(1 + u^2)."""
+    """Return half of the chord that slope `u` cuts from the body's circle, in radii, times sqrt(1 + u^2)."""
     beside = (body.right - body.forward * u) / body.rx
     return math.sqrt(max(0.0, 1.0 + u * u - beside * beside))
 
@@ -260,16 +261,16 @@ def root(body: Record, u: float) -> float:
 def mean_root(body: Record, left: float, right: float, one: float, other: float) -> float:
     """Return the mean of `root` over the slopes left .. right, at whose ends it is `one` and `other`.
 
-    Over u, the root is the arc of an ellipse, root^2 = crest - bend * (u - its middle)^2: its
-    area is that below the chord and the segment above, which the chord's length in the
-    ellipse's own axes determines.
+    As a function of u, the root is the arc of an ellipse, root^2 = crest - bend * (u - its middle)^2. The
+    area below the arc is the area below the chord plus the segment above, which follows from the chord's
+    length in the ellipse's own axes.
     """
-    if not body.bend > MIN_BEND:  # beside the eye, where it is a hyperbola
+    if not body.bend > MIN_BEND:  # a body beside the eye, for which the arc is a hyperbola
         return (one + 4.0 * root(body, 0.5 * (left + right)) + other) / 6.0
     wide = right - left
     square = 0.25 * (body.bend * wide * wide + (other - one) * (other - one)) / body.crest
     x = math.sqrt(square)
-    if square < 0.04:  # of the series, what is left out is below 1e-6 of the segment
+    if square < 0.04:  # the omitted terms of the series are below 1e-6 of the segment
         segment = x * square * (2.0 / 3.0 + square * (0.2 + square * (3.0 / 28.0 + square * 5.0 / 72.0)))
     else:
         square = min(1.0, square)
@@ -279,7 +280,7 @@ def mean_root(body: Record, left: float, right: float, one: float, other: float)
 
 @kernel
 def is_before(one: Record, other: Record, frame: Record, u: float) -> bool:
-    """Whether `one` may hide `other` along `u`: it is nearer; in height, if one is above the other."""
+    """Whether `one` may hide `other` along slope `u`: it is nearer (in height, if their depths overlap)."""
     entry, leave = depths(one, frame, u)
     entry_other, leave_other = depths(other, frame, u)
     common = min(leave, leave_other) - max(entry, entry_other)
@@ -294,7 +295,7 @@ def is_before(one: Record, other: Record, frame: Record, u: float) -> bool:
 
 @kernel
 def _look_along(body: Record, frame: Record, u: float) -> None:
-    """Store in the body its rows and its root along slope `u`, and a pole's cosine towards the sun."""
+    """Store in the body its rows and root along slope `u`, and for a pole the cosine to the sun."""
     arc = 0.0 if body.kind == BOX else root(body, u)
     body.cap, body.side, body.under, body.end = section(body, frame, u, arc)
     body.at, body.root = u, arc
@@ -304,7 +305,7 @@ def _look_along(body: Record, frame: Record, u: float) -> None:
 
 @inlined
 def cosine(body: Record, frame: Record, u: float, arc: float) -> float:
-    """Return the cosine between the sun and a pole's side where slope `u`, whose root is `arc`, meets it."""
+    """Return the cosine between the sun and a pole's side at slope `u`, where the root is `arc`."""
     entry = (body.right * u + body.forward - body.rx * arc) / (1.0 + u * u)
     right, forward = entry * u - body.right, entry - body.forward
     return (right * frame.sun_right + forward * frame.sun_forward) / body.rx
@@ -314,8 +315,8 @@ def cosine(body: Record, frame: Record, u: float, arc: float) -> float:
 def outline(body: Record, frame: Record, strip: Record) -> float:
     """Store the body's rows at both ends of the strip; return the mean of its root.
 
-    Edges are taken as straight. Where they are arcs, they are shifted to the mean of the arc:
-    rows depend on the root linearly.
+    Edges are taken as straight. An arc is shifted to its mean row, which follows from the mean root
+    because rows are linear in the root.
     """
     left, right = strip.slopes.left, strip.slopes.right
     if body.at != left:
@@ -351,13 +352,13 @@ def _bulge(edge: Record, middle: float) -> None:
 
 @inlined
 def _keep_below(edge: Record, limit: Record) -> None:
-    """Move both ends of an edge below a limit where they are above."""
+    """Move both ends of an edge down to a limit where they are above the limit."""
     edge.left, edge.right = max(edge.left, limit.left), max(edge.right, limit.right)
 
 
 @kernel
 def section(body: Record, frame: Record, u: float, arc: float) -> Section:
-    """Return the rows of the body along slope `u`, whose root is `arc`; numbers of moderate size."""
+    """Return the body's rows along slope `u`, where the root is `arc`, limited to +-`OUTSIDE`."""
     if body.kind == ELLIPSOID:
         return _ellipsoid_section(body, frame, u, arc)
     if body.kind == BOX:
@@ -388,7 +389,7 @@ def _moderate(row: float) -> float:
 
 @kernel
 def _cone_top(body: Record, frame: Record, u: float, far: float) -> float:
-    """Return the fall per depth where a cone begins: its tangent, its base's far edge, or inf (unseen)."""
+    """Return the fall per depth at a cone's upper edge: its tangent, its base's far edge, or inf (hidden)."""
     steep = body.rx / (body.top - body.bottom)
     rise = body.top - frame.eye_z
     over_bottom = frame.eye_z - body.bottom
@@ -407,7 +408,7 @@ def _cone_top(body: Record, frame: Record, u: float, far: float) -> float:
 def _ellipsoid_section(body: Record, frame: Record, u: float, arc: float) -> Section:
     """Return the rows of both tangents to an ellipse; of one tangent if the eye is over or under it.
 
-    In units of the half-axes: the fall per depth m touches where
+    In units of the half-axes, a ray of fall per depth m is a tangent if
     away * m^2 - 2 * middle * over * m + rest = 0.
     """
     half = 0.5 * (body.top - body.bottom)
@@ -420,7 +421,7 @@ def _ellipsoid_section(body: Record, frame: Record, u: float, arc: float) -> Sec
     ahead = middle * abs(over)
     if away > 1e-3:
         near = (ahead - root) / away
-    else:  # the same, exact also where the eye is over or under the equator
+    else:  # the same root, exact also if the eye is over or under the equator
         near = rest / (ahead + root) if middle > 0.0 else (ahead - root) / min(-1e-300, away)
         if middle > 0.0 and not ahead + root > 1e-9:  # at the tangent to the equator, level with it
             near = 0.0
@@ -441,7 +442,7 @@ def _ellipsoid_section(body: Record, frame: Record, u: float, arc: float) -> Sec
 def _above_ground(
     body: Record, frame: Record, u: float, buried: bool, upper: float, lower: float
 ) -> tuple[float, float]:
-    """Return the rows of an ellipsoid above the ground; `buried`: its upper tangent touches below."""
+    """Return the rows of an ellipsoid's part above ground; `buried`: the upper tangent touches below it."""
     half = 0.5 * (body.top - body.bottom)
     level = 1.0 + body.bottom / half  # of the middle above the ground, in half-heights
     square = 1.0 / (1.0 + u * u)

@@ -1,8 +1,8 @@
-"""Kernels of the ray caster: an image as strips, and a strip from near to far.
+"""Kernels of the ray caster: divide an image into strips, and paint each strip from near to far.
 
 Columns of pixels are cut at each silhouette. In a strip between two cuts all edges are taken
-as straight; what is nearer is painted first, and what remains uncovered is kept as gaps
-between edges. Input but poses is assumed valid.
+as straight. Nearer surfaces are painted first, and the uncovered rest is stored as gaps
+between edges. Except for poses, input is assumed valid.
 """
 
 import math
@@ -23,21 +23,21 @@ from envs.raycast.records import BODY, CUT, FRAME, GAP, STRIP, Bends, Canvas, En
 from envs.raycast.surfaces import enter_gap, show_body, show_walls, wall_depth
 from envs.scene import BOX, CONE, ELLIPSOID
 
-MIN_STRIP = 1e-9  # [pixels] cuts nearer than this are one
-ARC_PARTS = 3  # strips of equal height at either end of an ellipsoid's outline, of which there is
-ARC_ROWS = 1.0  # one for so many rows of the ellipsoid, if those are fewer
-MIN_ARC = 0.01  # [pixels] beside a cone's base, that a cut is worth
-GAPS = (701, 301, 132, 57, 23, 10, 4, 1)  # of the sort of cuts
-MAX_CUTS = 2 + 2 * max(2, ARC_PARTS)  # of one body: its ends, and corners or arcs
+MIN_STRIP = 1e-9  # [pixels] cuts closer than this count as one
+ARC_PARTS = 3  # most strips of equal height at each end of an ellipsoid's outline
+ARC_ROWS = 1.0  # rows of the ellipsoid for each of these strips after the first
+MIN_ARC = 0.01  # [pixels] smallest distance from a cone's silhouette at which a cut is worthwhile
+GAPS = (701, 301, 132, 57, 23, 10, 4, 1)  # for the Shell sort of cuts
+MAX_CUTS = 2 + 2 * max(2, ARC_PARTS)  # per body: its ends, and corners or arcs
 
 
 class Part(NamedTuple):
-    """The columns of an image that are painted, in pixels.
+    """The range of columns of an image to paint, in pixels.
 
     Attributes:
         half: Half of the image's width.
-        left: Where they begin.
-        right: Where they end.
+        left: Start of the range.
+        right: End of the range.
     """
 
     half: float
@@ -46,18 +46,18 @@ class Part(NamedTuple):
 
 
 class Workspace(NamedTuple):
-    """Room for painting, made once for many images of the same scene and height.
+    """Room for painting, allocated once for many images of the same scene and height.
 
     Attributes:
-        seen: (N,) BODY, those in view.
-        order: (N,) int64, those in a strip.
-        cuts: CUT, where columns are cut.
-        gaps: GAP, what nothing nearer covers of a strip.
+        seen: (N,) BODY, the bodies in view.
+        order: (N,) int64, indices in `seen` of the bodies in a strip.
+        cuts: CUT, the places where columns are cut.
+        gaps: GAP, the parts of a strip that nothing nearer covers.
         strips: (1,) STRIP.
-        frames: (1,) FRAME, of the pose that is painted.
+        frames: (1,) FRAME of the pose that is painted.
         accumulators: (BLOCK, LAYERS, height + PADDING) float64, zero between two blocks of columns.
-        mixing: For noise.
-        bends: For bodies that bend.
+        mixing: Room for noise.
+        bends: Room for curved bodies.
     """
 
     seen: np.ndarray
@@ -72,7 +72,7 @@ class Workspace(NamedTuple):
 
 
 def make_workspace(num_bodies: int, height: int) -> Workspace:
-    """Allocate room for painting images of `height` rows of a scene of `num_bodies` bodies."""
+    """Allocate room for painting images of `height` rows of a scene with `num_bodies` bodies."""
     return Workspace(
         seen=np.empty(num_bodies, BODY),
         order=np.empty(num_bodies, np.int64),
@@ -99,16 +99,16 @@ def render_way(
     """Fill images with the mean luminance over the area of each pixel.
 
     Args:
-        bodies: (N,) BODY, what `envs.raycast.records` describes.
-        noise: Of the scene.
-        scene_frame: (1,) FRAME, which lacks what a pose determines.
+        bodies: (N,) BODY, see `envs.raycast.records`.
+        noise: Noise textures of the scene.
+        scene_frame: (1,) FRAME without the fields that depend on the pose.
         poses: (K, 5) float64 x, y, z [m], yaw [rad], time [s].
-        columns: (K, W, H) float32, column after column, as cameras that look at columns keep an image.
+        columns: (K, W, H) float32, column after column, the layout of images in column cameras.
         cull: Bodies farther than this are not drawn [m].
         room: A `Workspace` for N bodies and H rows.
 
     Returns:
-        The index of the first pose that `envs.checks.check_pose` would refuse, or -1.
+        The index of the first pose for which `envs.checks.check_pose` would raise, or -1.
     """
     room.frames[0] = scene_frame[0]
     for k in range(len(poses)):
@@ -117,7 +117,7 @@ def render_way(
         if not (near and abs(yaw) < np.inf and abs(time) <= LIMIT_S):
             return k
         aim(room.frames[0], x, y, z, yaw, time)
-        first = np.int64(0)  # not 0, for which numba would compile all of it a second time
+        first = np.int64(0)  # a plain 0 would make numba compile everything a second time
         paint_columns(bodies, noise, columns[k].T, first, columns.shape[1], cull, room)
     return -1
 
@@ -132,9 +132,9 @@ def paint_columns(
     cull: float,
     room: Workspace,
 ) -> None:
-    """Fill columns `first` .. `last` - 1 of an image (H, W), seen as `room.frames[0]` says.
+    """Fill columns `first` .. `last` - 1 of an image (H, W) seen from the pose in `room.frames[0]`.
 
-    A column has the same bytes whichever columns are painted with it.
+    A column has the same bytes whichever columns are painted in the same call.
     """
     frame, half = room.frames[0], 0.5 * image.shape[1]
     if frame.discs:
@@ -151,7 +151,7 @@ def paint_columns(
 
 @kernel
 def _sort_cuts(cuts: np.ndarray, size: int) -> None:
-    """Sort the first cuts by position (Shell 1959, with gaps after Ciura 2001)."""
+    """Sort the first `size` cuts by position (Shell 1959, with gaps after Ciura 2001)."""
     for gap in GAPS:
         for i in range(gap, size):
             position, body, begins = cuts[i].position, cuts[i].body, cuts[i].begins
@@ -166,9 +166,9 @@ def _sort_cuts(cuts: np.ndarray, size: int) -> None:
 def _sweep(
     room: Workspace, noise: Noise, total: int, cuts: np.ndarray, image: np.ndarray, first: int, last: int
 ) -> None:
-    """Paint the strips between cuts from left to right, with the bodies that are there in each.
+    """Paint the strips between cuts from left to right, each with the bodies present in it.
 
-    `room.order` holds the `total` bodies that have begun at the left edge of column `first`.
+    At the start, `room.order` holds the `total` bodies present at the left edge of column `first`.
     """
     frame, strip, seen, order = room.frames[0], room.strips[0], room.seen, room.order
     half, samples, focal, slopes = 0.5 * image.shape[1], frame.samples, frame.focal, strip.slopes
@@ -201,7 +201,7 @@ def _sweep(
 
 @inlined
 def _texture(canvas: Canvas, cell: int, half: float) -> None:
-    """Add the patterns of ground and walls to a cell, and to its column if it is the last one there."""
+    """Add the patterns of ground and walls to a cell, and to the column if this is its last cell."""
     frame, samples, focal = canvas.frame, canvas.frame.samples, canvas.frame.focal
     if frame.ground_texture.contrast > 0.0 or frame.wall_texture.contrast > 0.0:
         column = cell // samples
@@ -212,7 +212,7 @@ def _texture(canvas: Canvas, cell: int, half: float) -> None:
 
 @kernel
 def aim(frame: Record, x: float, y: float, z: float, yaw: float, time: float) -> None:
-    """Fill in what a pose adds to the frame."""
+    """Set the fields of the frame that depend on the pose."""
     frame.eye_x, frame.eye_y, frame.eye_z, frame.time = x, y, z, time
     cos, sin = math.cos(yaw), math.sin(yaw)
     frame.cos, frame.sin = cos, sin
@@ -222,7 +222,7 @@ def aim(frame: Record, x: float, y: float, z: float, yaw: float, time: float) ->
 
 @inlined
 def _add_cut(cuts: np.ndarray, size: int, part: Part, position: float, shown: bool) -> int:
-    """Store a cut of a column if it is `shown` and in the part; return the new number of cuts."""
+    """Store a cut of a column if it is `shown` and within the part; return the new number of cuts."""
     cuts[size].position, cuts[size].body = position, -1
     return size + (shown and part.left < position < part.right)
 
@@ -234,7 +234,7 @@ def _find_cuts(
     """Collect the cuts inside the part of the image that is painted.
 
     Returns:
-        The number of cuts, and that of bodies already begun at its left edge, in `order`.
+        The number of cuts, and the number of bodies in `order`, which begin at or before its left edge.
     """
     size = total = 0
     centre, focal = part.half, frame.focal
@@ -266,11 +266,11 @@ def _find_cuts(
 
 @kernel
 def _cone_cuts(frame: Record, body: Record, part: Part, cuts: np.ndarray, size: int) -> int:
-    """Add the axis of a cone, and where its straight outlines meet the edge of its base."""
+    """Add cuts at the axis of a cone and where its straight outlines meet the edge of its base."""
     right, forward, radius = body.right, body.forward, body.rx
     square = right * right + forward * forward
     rise = body.top - frame.eye_z
-    # Of the turn about the axis from the eye to the outline, the cosine over the distance.
+    # Cosine of the angle about the axis from the eye to the outline, divided by the eye's distance.
     cosine = radius * radius * rise / ((body.top - body.bottom) * max(square, MIN_DEPTH))
     rest = radius * radius / max(square, MIN_DEPTH) - cosine * cosine
     for k in range(-1, 2):
@@ -288,7 +288,7 @@ def _cone_cuts(frame: Record, body: Record, part: Part, cuts: np.ndarray, size: 
 def _arc_cuts(frame: Record, body: Record, part: Part, cuts: np.ndarray, size: int) -> int:
     """Add cuts where an ellipsoid's outline bends most: in the outermost cell at its left and right end.
 
-    The outline rises there as a square root does, and so cuts divide its height evenly.
+    The outline rises like a square root there, so the spacing of the cuts divides its height evenly.
     """
     low, high = body.low, body.high
     reach = min(0.5 * (high - low), 1.0 / (frame.samples * frame.focal))
@@ -303,7 +303,7 @@ def _arc_cuts(frame: Record, body: Record, part: Part, cuts: np.ndarray, size: i
 
 @kernel
 def _corner_cuts(frame: Record, body: Record, part: Part, cuts: np.ndarray, size: int) -> int:
-    """Add the corners of a box at which what it shows changes: the nearest; all, from above or below."""
+    """Add cuts at the nearest corner of a box, or at all corners if its top or underside is visible."""
     level = frame.eye_z > body.top or frame.eye_z < body.bottom
     nearest, least = 0, math.inf
     for k in range(4):
@@ -319,7 +319,10 @@ def _corner_cuts(frame: Record, body: Record, part: Part, cuts: np.ndarray, size
 
 @kernel
 def _pass(order: np.ndarray, known: int, total: int, cut: Record) -> tuple[int, int]:
-    """Begin or end a body: `order` holds `total` of them, of which the first `known` are sorted."""
+    """Begin or end a body at a cut; return the new `known` and `total`.
+
+    `order` holds `total` bodies, of which the first `known` are sorted.
+    """
     if cut.body < 0:
         return known, total
     if cut.begins:
@@ -335,9 +338,9 @@ def _pass(order: np.ndarray, known: int, total: int, cut: Record) -> tuple[int, 
 
 @kernel
 def _sort_new(frame: Record, seen: np.ndarray, order: np.ndarray, known: int, total: int, u: float) -> None:
-    """Sort the newly begun bodies in among the `known` others by what hides what along `u`.
+    """Insert the newly begun bodies into the `known` sorted bodies, by which hides which along slope `u`.
 
-    Bodies are convex and do not overlap, so that this order holds as long as both are there.
+    Bodies are convex and do not overlap, so the order of two bodies holds as long as both are present.
     """
     for k in range(known, total):
         new = order[k]
@@ -367,7 +370,7 @@ def _paint_strip(canvas: Canvas, seen: np.ndarray, order: np.ndarray) -> None:
         if leave <= max(0.0, entry):
             continue
         count = show_walls(canvas, count, entry)
-        # Nothing behind can rise above this row, and below the gap is only ground.
+        # Nothing behind can rise above this row, and everything below the gap is ground.
         rise = frame.horizon - highest / max(MIN_DEPTH, entry)
         bottom = gaps[0].bottom
         if count == 0 or (count == 1 and bottom.left <= rise and bottom.right <= rise):

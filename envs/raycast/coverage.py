@@ -1,13 +1,13 @@
 """Kernels that paint one column: areas between straight edges, by exact coverage.
 
-Layer STEPS of the accumulators holds how much brighter each row of pixels is than the one
-above, so that a flat area of any height costs few additions; PAINT holds luminance added to a
-single row. The background, sky above the horizon and plain ground below, is added once per
-column by `resolve`: an area is painted as its difference from the background, and background
+Layer STEPS of the accumulators holds the difference in brightness between each row of pixels
+and the row above, so that a flat area of any height costs few additions; PAINT holds luminance
+added to a single row. `resolve` adds the background (sky above the horizon, plain ground below)
+once per column: an area is painted as its difference from the background, and background
 that nothing hides costs nothing.
 
-An edge is straight from the left to the right end of the strip being painted, and given by
-its rows there. Where edges divide a strip, the shares of each row add up to one exactly.
+An edge is straight from the left to the right end of the strip being painted, and is given by
+its rows at both ends. Where edges divide a strip, the shares of each row add up to exactly one.
 """
 
 from enum import IntEnum
@@ -17,17 +17,17 @@ import numpy as np
 from envs.compiled import inlined, kernel
 from envs.raycast.records import Ends, Record
 
-MIN_RISE = 1e-9  # [rows] an edge that slopes less is level
-BLOCK = 4  # columns that are resolved together, because sums that do not wait for each other are fast
+MIN_RISE = 1e-9  # [rows] an edge that rises less counts as level
+BLOCK = 4  # columns resolved together, because independent sums run in parallel
 PADDING = 3  # elements of a layer beyond the rows of the image
 
 
 class Layer(IntEnum):
-    """Where the layers of the accumulators begin."""
+    """First index of each layer of the accumulators."""
 
-    STEPS = 0  # the last element is what changes at the horizon
+    STEPS = 0  # the last element is the change at the horizon
     PAINT = 1
-    GROUND = 2  # what shows of ground and walls, three layers each, see `cover`
+    GROUND = 2  # visible parts of ground and walls, three layers each, see `cover`
     RIGHT_WALL = 5
     LEFT_WALL = 8
 
@@ -37,7 +37,7 @@ LAYERS = Layer.LEFT_WALL + 3
 
 @kernel
 def _step(layer: np.ndarray, row: float, change: float) -> None:
-    """Add `change` to everything below `row`; exact for the row that it cuts."""
+    """Add `change` to everything below `row`; exact for the pixel row that it cuts."""
     r = int(row)
     below = change * (row - r)
     layer[r] += change - below
@@ -46,7 +46,7 @@ def _step(layer: np.ndarray, row: float, change: float) -> None:
 
 @kernel
 def _ramp(layer: np.ndarray, left: float, right: float, change: float) -> None:
-    """Add `change` to everything below an edge from row `left` to row `right`; exact for the rows it cuts."""
+    """Add `change` to everything below an edge from row `left` to `right`; exact for the rows it cuts."""
     low, high = min(left, right), max(left, right)
     first, last = int(low), int(high)
     if first == last or high - low < MIN_RISE:
@@ -76,7 +76,7 @@ def share_below(row: float, edge: Ends) -> float:
 
 @kernel
 def _paint_below(frame: Record, steps: np.ndarray, edge: Ends, luminance: float, weight: float) -> None:
-    """Paint all below an edge with one luminance over the background."""
+    """Paint everything below an edge with one luminance over the background."""
     left, right = edge
     horizon = frame.horizon
     over_sky, over_floor = weight * (luminance - frame.sky), weight * (luminance - frame.floor)
@@ -107,9 +107,9 @@ def fill(
 def resolve(
     frame: Record, accumulators: np.ndarray, image: np.ndarray, column: int, first: int, last: int
 ) -> None:
-    """Finish a painted column; once there are `BLOCK`, or it is the last, write them into the image.
+    """Finish a painted column; write the block into the image if it is full or this is the last column.
 
-    Columns `first` .. `last` - 1 are painted, each into its place of the accumulators (BLOCK, LAYERS, ...).
+    Columns `first` .. `last` - 1 are painted, each into its place in the accumulators (BLOCK, LAYERS, ...).
     """
     place = (column - first) % BLOCK
     steps = accumulators[place, Layer.STEPS]
@@ -120,7 +120,7 @@ def resolve(
 
 @kernel
 def _sum_block(sky: float, painted: np.ndarray, image: np.ndarray, first: int, count: int) -> None:
-    """Write columns `first` .. `first` + `count` - 1 and clear all places; others are summed for nothing."""
+    """Write columns `first` .. `first` + `count` - 1 of a block and clear the block; it sums all of them."""
     one = two = three = four = sky
     for row in range(image.shape[0]):
         one += painted[0, Layer.STEPS, row]
@@ -129,7 +129,7 @@ def _sum_block(sky: float, painted: np.ndarray, image: np.ndarray, first: int, c
         four += painted[3, Layer.STEPS, row]
         painted[0, Layer.STEPS, row], painted[1, Layer.STEPS, row] = one, two
         painted[2, Layer.STEPS, row], painted[3, Layer.STEPS, row] = three, four
-    for k in range(count):  # in wide instructions, for which the sums above have to wait too long
+    for k in range(count):  # a loop of its own, which compiles to wide instructions, unlike the sums above
         for row in range(image.shape[0]):
             image[row, first + k] = painted[k, Layer.STEPS, row] + painted[k, Layer.PAINT, row]
     painted[:, Layer.STEPS : Layer.GROUND] = 0.0
@@ -137,15 +137,15 @@ def _sum_block(sky: float, painted: np.ndarray, image: np.ndarray, first: int, c
 
 @kernel
 def cover(shown: np.ndarray, top: Ends, bottom: Ends, weight: float, u: float) -> None:
-    """Store that a surface shows between two edges; `envs.raycast.patterns` adds its pattern.
+    """Record that a surface is visible between two edges; `envs.raycast.patterns` adds its pattern later.
 
     Args:
-        shown: The surface's three layers: the share of each row that shows it, and where in the
-            row and along the slopes this part has its middle, as first moments.
+        shown: The surface's three layers: the visible share of each row, and the first moments of
+            this part down the row and along the slopes.
         top: Upper edge.
         bottom: Lower edge.
-        weight: Width [pixels].
-        u: Slope of the middle.
+        weight: Width of the area [pixels].
+        u: Slope of its middle.
     """
     _ramp(shown[0], top.left, top.right, weight)
     _ramp(shown[0], bottom.left, bottom.right, -weight)
@@ -162,7 +162,7 @@ def cover(shown: np.ndarray, top: Ends, bottom: Ends, weight: float, u: float) -
 def cover_ground(
     frame: Record, accumulators: np.ndarray, top: Ends, bottom: Ends, weight: float, u: float
 ) -> None:
-    """`cover` the ground between two edges; nothing of it shows above the horizon."""
+    """Apply `cover` to the ground between two edges; none of it is visible above the horizon."""
     top = Ends(max(top.left, frame.horizon), max(top.right, frame.horizon))
     bottom = Ends(max(bottom.left, frame.horizon), max(bottom.right, frame.horizon))
     if is_open(top, bottom):
@@ -183,10 +183,10 @@ def put(record: Record, value: Ends) -> None:
 
 @inlined
 def beyond(edge: Ends, limit: Ends) -> Ends:
-    """Return an edge, moved below a limit where it is above.
+    """Return an edge, moved down to a limit where it is above the limit.
 
-    Where they cross, what lies between them is a triangle that ends there: it is drawn as one
-    of the same area that reaches through the strip.
+    Where the two cross, the area between them is a triangle that ends at the crossing. It is replaced by a
+    triangle of the same area that spans the strip.
     """
     one, other = edge.left - limit.left, edge.right - limit.right
     if one >= 0.0 and other >= 0.0:
@@ -206,13 +206,13 @@ def is_open(top: Ends, bottom: Ends) -> bool:
 
 @inlined
 def _cut_ends(left: Record, right: Record, part: float) -> None:
-    """Cut `left` and its copy `right`, so that each holds its own part."""
+    """Cut an edge, of which `right` is a copy, so that `left` and `right` hold one part each."""
     left.right = right.left = left.left + part * (left.right - left.left)
 
 
 @kernel
 def cut_gap(gaps: np.ndarray, k: int, new: int, part: float) -> None:
-    """Cut gap `k` after a part of its width; the rest becomes gap `new`."""
+    """Cut gap `k` at a fraction of its width; the rest becomes gap `new`."""
     gaps[new] = gaps[k]
     left, right = gaps[k], gaps[new]
     _cut_ends(left.top, right.top, part)

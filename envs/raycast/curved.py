@@ -1,6 +1,6 @@
-"""Kernels that light and texture what bends along a column: the side of a cone, an ellipsoid.
+"""Kernels that light and texture surfaces that are curved along a column: ellipsoids and the sides of cones.
 
-Each row of a strip has a light of its own. Input is assumed valid.
+Each row of a strip has its own luminance. Input is assumed valid.
 """
 
 import math
@@ -16,9 +16,9 @@ from envs.raycast.patterns import mean_pattern
 from envs.raycast.records import Bends, Canvas, Ends, Record
 from envs.scene import CONE
 
-GAUSS = 0.5 / math.sqrt(3.0)  # how far from the middle two points stand that stand for a length of 1
-LENGTH = 1.0 / (2.0 * GAUSS)  # of what two such points stand for, by their distance
-POINTS = 4  # of each row: two across, and at each of these two down
+GAUSS = 0.5 / math.sqrt(3.0)  # distance from the middle of the two points that represent a length of 1
+LENGTH = 1.0 / (2.0 * GAUSS)  # represented length over the distance of the two points
+POINTS = 4  # sample points per row: at each of two slopes, two heights
 LEAST = 1e-300  # instead of 0 in a denominator
 
 
@@ -26,13 +26,13 @@ class Quadric(NamedTuple):
     """A cone's side or an ellipsoid: right^2 + forward^2 + ratio * up^2 = size around its apex or middle [m].
 
     Attributes:
-        right: Of its axis, from the eye.
-        forward: Of its axis, from the eye.
-        radius: Of its footprint.
-        ratio: No length.
-        over: Height of the eye over its apex or middle.
-        size: [m^2]
-        rest: The left side minus the right one at the eye [m^2].
+        right: Right coordinate of the axis, from the eye.
+        forward: Forward coordinate of the axis, from the eye.
+        radius: Radius of the footprint.
+        ratio: As in the equation; dimensionless.
+        over: Height of the eye over the apex or middle.
+        size: As in the equation [m^2].
+        rest: The left side of the equation minus the right side at the eye [m^2].
     """
 
     right: float
@@ -48,11 +48,11 @@ class Light(NamedTuple):
     """Direction of the sun and the terms of a body's light.
 
     Attributes:
-        right: Of the direction to the sun, which has length 1.
-        forward: The same.
-        up: The same.
-        ambient: Luminance where the sun does not shine.
-        diffuse: What is added where it shines at right angles.
+        right: Right component of the unit vector to the sun.
+        forward: Its forward component.
+        up: Its upward component.
+        ambient: Luminance without sun.
+        diffuse: Luminance added by the sun at normal incidence.
     """
 
     right: float
@@ -63,15 +63,15 @@ class Light(NamedTuple):
 
 
 class Patch(NamedTuple):
-    """Part of a body that shows in a gap.
+    """Part of a body that is visible in a gap.
 
     Attributes:
         left: Slope of its left end.
         wide: Its width in slopes.
         top: Its upper edge [rows].
         bottom: Its lower edge [rows].
-        first: The first row that it reaches into.
-        rows: How many rows it reaches into.
+        first: The first row that it overlaps.
+        rows: Number of rows that it overlaps.
         horizon: Row of the horizon.
         per_row: Fall per depth and row.
     """
@@ -87,7 +87,7 @@ class Patch(NamedTuple):
 
 
 class Place(NamedTuple):
-    """Right and forward of a curved body's axis, and above its middle or apex [m]."""
+    """A point relative to a curved body: right and forward of its axis, above its middle or apex [m]."""
 
     right: float
     forward: float
@@ -96,7 +96,7 @@ class Place(NamedTuple):
 
 def make_bends(height: int) -> Bends:
     """Allocate room for images of `height` rows."""
-    rows = height + 4  # one cut at either end, and as many as a vector holds
+    rows = height + 4  # a cut row at each end, and padding to whole vectors
     return Bends(*np.zeros((5, POINTS * rows)))
 
 
@@ -112,7 +112,7 @@ def _quadric(body: Record, frame: Record) -> Quadric:
 
 @inlined
 def _footprint(shape: Quadric, u: float) -> tuple[float, float]:
-    """Return the depths between which slope `u` is over the footprint [m]."""
+    """Return the depths at which slope `u` enters and leaves the footprint [m]."""
     square, beside = 1.0 + u * u, (shape.right - shape.forward * u) / shape.radius
     half = shape.radius * math.sqrt(max(0.0, square - beside * beside))
     middle, per_square = shape.right * u + shape.forward, 1.0 / square
@@ -121,7 +121,7 @@ def _footprint(shape: Quadric, u: float) -> tuple[float, float]:
 
 @inlined
 def _meet(shape: Quadric, u: float, fall: float, nearest: float, farthest: float) -> Place:
-    """Return where the ray of slope `u` and of `fall` per depth meets a quadric, between two depths.
+    """Return the point where the ray of slope `u` and `fall` per depth meets a quadric, between two depths.
 
     The depth is a root of a * depth^2 - 2 * b * depth + rest.
     """
@@ -137,7 +137,7 @@ def _meet(shape: Quadric, u: float, fall: float, nearest: float, farthest: float
 
 @kernel
 def shade_rows(canvas: Canvas, body: Record, top: Ends, bottom: Ends) -> None:
-    """Light a cone's side or an ellipsoid between two edges in the gap, and add its pattern, row by row."""
+    """Light a cone's side or an ellipsoid between two edges in the gap, row by row, including its pattern."""
     frame, strip, lights = canvas.frame, canvas.strip, canvas.bends.lights
     first, last = int(min(top.left, top.right)), math.ceil(max(bottom.left, bottom.right))
     left, wide = strip.gap_slopes.left, strip.gap_slopes.right - strip.gap_slopes.left
@@ -154,10 +154,10 @@ def shade_rows(canvas: Canvas, body: Record, top: Ends, bottom: Ends) -> None:
 
 @kernel
 def _texture_rows(canvas: Canvas, body: Record, shape: Quadric, patch: Patch) -> None:
-    """Multiply the lights of each row by the mean of the pattern over what shows of it.
+    """Multiply the lights of each row by the mean of the pattern over the row's visible part.
 
-    The points at which a row is lit have the middle and the spread of what shows; so does the parallelogram
-    over which the pattern is averaged, and a row that an edge cuts has its pattern where the rest shows.
+    The row's sample points have the mean and the spread of its visible part. The pattern is averaged over a
+    parallelogram with the same mean and spread, so a row cut by an edge gets the pattern of its visible part.
     """
     frame, bends = canvas.frame, canvas.bends
     lights, turns, ups, talls = bends.lights, bends.turns, bends.ups, bends.talls
@@ -182,22 +182,22 @@ def _texture_rows(canvas: Canvas, body: Record, shape: Quadric, patch: Patch) ->
 
 @inlined
 def _back(turn: float) -> float:
-    """Return a difference of two angles by the shorter way [rad]."""
+    """Return a difference of two angles, wrapped to [-pi, pi) [rad]."""
     return turn - 2.0 * math.pi * math.floor(turn / (2.0 * math.pi) + 0.5)
 
 
 @kernel
 def _find_turns(points: int, turns: np.ndarray, aheads: np.ndarray) -> None:
-    """Replace sines in `turns`, whose cosines are in `aheads`, by their angles [rad]; without branches."""
+    """Replace sines in `turns`, with cosines in `aheads`, by the angles [rad]; without branches."""
     for p in range(points):
         turns[p] = _angle(turns[p], aheads[p])
 
 
 @inlined
 def _angle(sine: float, cosine: float) -> float:
-    """`math.atan2` to 1e-6, without branches."""
+    """Compute `math.atan2` to 1e-6, without branches."""
     length = math.sqrt(max(LEAST, sine * sine + cosine * cosine))
-    half = sine / (length + abs(cosine))  # tangent of the half of the angle, and of its quarter
+    half = sine / (length + abs(cosine))  # tangent of half the angle; then x, of a quarter of it
     x = half / (1.0 + math.sqrt(1.0 + half * half))
     square = x * x
     series = 1.0 / 9.0 - square * (1.0 / 11.0 - square * (1.0 / 13.0 - square / 15.0))
@@ -208,10 +208,11 @@ def _angle(sine: float, cosine: float) -> float:
 
 @kernel
 def _light_points(shape: Quadric, light: Light, patch: Patch, bends: Bends) -> None:
-    """Fill `bends.lights` with the luminance at four points of each row, times their parts of the row.
+    """Fill `bends.lights` with the luminance at four points of each row, times the part of the row of each.
 
-    At each of two slopes, quarters of what two edges leave of a row; the rest of `bends` is where that is. A
-    loop without branches: rays side by side take a vector's time.
+    There are two points at each of two slopes, within the part of the row between the two edges. The other
+    arrays of `bends` get the positions of the points. The loop has no branches, so that it compiles to
+    vector instructions.
     """
     top, bottom, horizon, per_row = patch.top, patch.bottom, patch.horizon, patch.per_row
     lights, turns, aheads, ups, talls = bends
@@ -220,11 +221,11 @@ def _light_points(shape: Quadric, light: Light, patch: Patch, bends: Bends) -> N
     high, low = min(top.left, top.right), max(bottom.left, bottom.right)
     top_falls, top_rises = 1.0 * (fall_top >= MIN_RISE), 1.0 * (fall_top <= -MIN_RISE)
     bottom_falls, bottom_rises = 1.0 * (fall_bottom >= MIN_RISE), 1.0 * (fall_bottom <= -MIN_RISE)
-    rows = patch.rows + patch.rows % 2  # what does not fill a vector takes as long as many that do
+    rows = patch.rows + patch.rows % 2  # a partly filled vector would take as long as many full ones
     for p in range(POINTS * rows):
         row = float(patch.first + (p >> 2))
         start, end = max(high, row), min(low, row + 1.0)
-        # From where to where in the strip the edges leave something of the row.
+        # Range of the strip in which part of the row lies between the edges.
         below_top = min(1.0, max(0.0, (end - top.left) * per_top))
         above_bottom = min(1.0, max(0.0, (start - bottom.left) * per_bottom))
         right = min(1.0 - top_falls * (1.0 - below_top), 1.0 - bottom_rises * (1.0 - above_bottom))
@@ -259,7 +260,7 @@ def _inverse(rise: float) -> float:
 
 @inlined
 def _below(row: float, edge: Ends, per_rise: float) -> float:
-    """`coverage.share_below` without branches."""
+    """Compute `coverage.share_below` without branches."""
     low, spread = min(edge.left, edge.right), abs(edge.right - edge.left)
     above, below = min(max(row - low, 0.0), spread), min(max(row + 1.0 - low, 0.0), spread)
     cut = 0.5 * (below - above) * (below + above) * abs(per_rise)

@@ -1,10 +1,10 @@
-"""Kernels that draw spheres pixel by pixel: what `renderer=spheres` does, for worlds of hundreds of them.
+"""Kernels that draw spheres pixel by pixel (`renderer=spheres`), for worlds of hundreds of spheres.
 
 The strips of `envs.raycast.columns` are exact, but each silhouette in a column cuts all bodies there. Here a
-sphere covers the share of a cell that a straight edge along its silhouette would cover, shares of spheres
-one behind the other multiply, and the light is that at the middle. A cell is a pixel, or one of samples^2
-parts of it. A disc that is narrower than `NARROW` is taken as a rectangle of the same area. Walls and
-textures are not drawn. Input is assumed valid.
+sphere covers the share of a cell that a straight edge along its silhouette would cover; the uncovered shares
+of spheres one behind the other multiply; and the light is that at the middle of the cell. A cell is a pixel,
+or one of samples^2 parts of it. A disc narrower than `NARROW` is drawn as a rectangle of the same area. Walls
+and textures are not drawn. Input is assumed valid.
 """
 
 import math
@@ -16,8 +16,8 @@ from envs.raycast.bodies import MIN_DEPTH, see_bodies
 from envs.raycast.records import Record
 
 NARROW = 1.5  # [cells], width or height of a disc
-SQUARE = 0.5 * math.sqrt(math.pi)  # sides of a rectangle by the axes of an ellipse of its area
-GAPS = (301, 132, 57, 23, 10, 4, 1)  # of the sort
+SQUARE = 0.5 * math.sqrt(math.pi)  # sides of a rectangle over the axes of an ellipse of the same area
+GAPS = (301, 132, 57, 23, 10, 4, 1)  # for the Shell sort
 LEAST = 1e-12  # instead of 0 in a denominator
 
 
@@ -82,7 +82,7 @@ def _sort(seen: np.ndarray, order: np.ndarray) -> None:
 
 @inlined
 def _add(frame: Record, shown: np.ndarray, light: np.ndarray, pixels: np.ndarray) -> None:
-    """Add the cells of a column to the pixels, and behind them what is `shown` of sky and ground."""
+    """Add the cells of a column to the pixels, and the shares `shown` of sky and ground behind them."""
     fine = frame.samples
     per_pixel = 1.0 / (fine * fine)
     for row in range(pixels.size):
@@ -96,9 +96,9 @@ def _add(frame: Record, shown: np.ndarray, light: np.ndarray, pixels: np.ndarray
 
 @kernel
 def _outline(body: Record, frame: Record) -> None:
-    """Store the rows between which a sphere shows, `cap` and `end`, and the square of its tangents, `power`.
+    """Store the first and last row of a sphere, `cap` and `end`, and its squared tangent length, `power`.
 
-    Of spheres that do not overlap, the one with the shorter tangents may hide the other.
+    If two spheres do not overlap, the one with the shorter tangents may hide the other.
     """
     radius, forward, up = body.rx, body.forward, _up(body, frame)
     power = forward * forward + up * up - radius * radius
@@ -121,7 +121,10 @@ def _up(body: Record, frame: Record) -> float:
 
 @inlined
 def _cover(body: Record, frame: Record, left: float, shown: np.ndarray, light: np.ndarray) -> None:
-    """Paint a sphere where cells are `shown` behind nearer ones; their column begins at `left` [pixels]."""
+    """Paint a sphere into one column of cells, which begins at `left` [pixels], behind nearer spheres.
+
+    `shown` is the share of each cell that nearer spheres leave uncovered.
+    """
     fine = frame.samples
     first = int(fine * min(max(body.cap, 0.0), 2.0 * frame.horizon))
     last = math.ceil(fine * min(max(body.end, 0.0), 2.0 * frame.horizon))
@@ -137,10 +140,10 @@ def _cover(body: Record, frame: Record, left: float, shown: np.ndarray, light: n
 def _cover_wide(
     body: Record, frame: Record, left: float, first: int, bulge: float, shown: np.ndarray, light: np.ndarray
 ) -> None:
-    """Paint a disc of some cells into those from row `first` on.
+    """Paint a disc that is several cells wide, from row `first` on.
 
-    An arc is farther inside than its tangent by `bulge`, on average over a cell [cells]. A loop without
-    branches: rows side by side take a vector's time.
+    On average over a cell, an arc is farther inside than its tangent by `bulge` [cells]. The loop has no
+    branches, so that it compiles to vector instructions.
     """
     right, forward, radius, up = body.right, body.forward, body.rx, _up(body, frame)
     focal, horizon = frame.samples * frame.focal, frame.samples * frame.horizon
@@ -148,10 +151,10 @@ def _cover_wide(
     ambient, diffuse = body.albedo * frame.ambient, body.albedo * frame.diffuse
     u, per_row, per_radius = (frame.samples * left + 0.5) / focal, 1.0 / focal, 1.0 / radius
     square, top = 1.0 + u * u, horizon - first - 0.5
-    for row in range(shown.size):  # from 0 on: of other numbers numba asks whether they are negative
+    for row in range(shown.size):  # from 0, or numba would check each index for being negative
         v = (top - row) * per_row
         per_square = 1.0 / (square + v * v)
-        # The point of the ray that is nearest to the middle, as seen from there.
+        # The ray's point nearest to the sphere's middle, relative to that middle.
         depth = (right * u + forward + up * v) * per_square
         x, y, z = depth * u - right, depth - forward, depth * v - up
         miss = math.sqrt(x * x + y * y + z * z)
@@ -172,10 +175,10 @@ def _share(inside: float, x: float, z: float, per_across: float) -> float:
     """Return the share of a cell on this side of a straight edge.
 
     Args:
-        inside: How far its middle is from the edge, on this side [cells].
-        x: Of the edge's normal, >= 0.
-        z: The same.
-        per_across: By the normal's length.
+        inside: Distance of the cell's middle from the edge, positive on this side [cells].
+        x: Horizontal component of the edge's normal, >= 0.
+        z: Vertical component of the edge's normal, >= 0.
+        per_across: 1 / length of the normal.
     """
     most, least = max(x, z) * per_across, min(x, z) * per_across
     away = abs(inside)
@@ -189,7 +192,7 @@ def _share(inside: float, x: float, z: float, per_across: float) -> float:
 def _cover_narrow(
     body: Record, frame: Record, left: float, first: int, shown: np.ndarray, light: np.ndarray
 ) -> None:
-    """Paint a disc that is narrower than a cell as a rectangle of its area, lit as its middle is."""
+    """Paint a disc narrower than `NARROW` as a rectangle of the same area, with the light of its middle."""
     fine, up = frame.samples, _up(body, frame)
     wide = SQUARE * 0.5 * fine * frame.focal * (body.high - body.low)
     tall = SQUARE * 0.5 * fine * (body.end - body.cap)

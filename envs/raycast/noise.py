@@ -1,10 +1,10 @@
 """Noise: a sum of waves, each of which has a known mean over a parallelogram.
 
-The waves are those of `envs.scene.textures.noise_waves`. From a given height a pixel always shows the
-same piece of the ground as seen from the camera; so the mean of each wave over each pixel of the
-ground is tabulated, and where the camera is only turns the waves. Numbers are float32: means over
-parallelograms are right to 1e-5 of the noise, those of the ground, which is cut into some, to 0.02
-(tests/envs/raycast/test_noise.py).
+The waves come from `envs.scene.textures.noise_waves`. At a given height a pixel always shows the same
+piece of the ground relative to the camera. So the mean of each wave over each pixel of the ground is
+tabulated, and the camera's position only shifts the phases of the waves. Numbers are float32. Means over
+parallelograms are accurate to 1e-5 of the noise, means over the ground, which combine several
+parallelograms, to 0.02 (tests/envs/raycast/test_noise.py).
 """
 
 import math
@@ -18,19 +18,19 @@ from envs.compiled import inlined, kernel
 from envs.raycast.records import Mixing, Noise, Record
 from envs.scene.textures import TILE_PERIODS, noise_waves
 
-WAVES = len(noise_waves(0)[0])  # a multiple of four, by which they are summed
-PARTS = 64  # of a pixel of the ground, at most: beyond, waves cancel
-LONGEST = 1e6  # [tiles]
-MAX_TABLE = 2**22  # numbers in a table of the ground; larger images average each pixel again
+WAVES = len(noise_waves(0)[0])  # a multiple of four, because `mean_noise` adds four at a time
+PARTS = 64  # most parts of a ground pixel; with more, waves cancel
+LONGEST = 1e6  # [tiles] longest side of a parallelogram
+MAX_TABLE = 2**22  # most numbers in a table of the ground; larger images average each pixel in each render
 
 REAL = np.float32
 PI, ONE, TWO, HALF = REAL(math.pi), REAL(1.0), REAL(2.0), REAL(0.5)
-# Taylor's series of sin(pi x), to 6e-8 for |x| <= 1/2.
+# Taylor series of sin(pi x), accurate to 6e-8 for |x| <= 1/2.
 SINE = tuple(REAL((-1) ** k * math.pi ** (2 * k + 1) / math.factorial(2 * k + 1)) for k in range(6))
 
 
 class Footprint(NamedTuple):
-    """The parallelogram of a surface that is averaged, by its two sides along s and q."""
+    """The parallelogram of a surface to average over, given by its two sides in s and q."""
 
     one_s: float
     one_q: float
@@ -68,7 +68,7 @@ def _cosine_of_turn(turn: np.float32) -> np.float32:
 
 @inlined
 def _mean_over(cycles: np.float32) -> np.float32:
-    """Return the factor by which the mean over so many cycles weakens a wave: sin(pi x) / (pi x)."""
+    """Return the factor by which averaging over `cycles` weakens a wave: sin(pi x) / (pi x)."""
     turn = cycles - TWO * np.rint(HALF * cycles)
     size = abs(turn)
     sine = np.copysign(_sine(min(size, ONE - size)), turn)
@@ -77,7 +77,7 @@ def _mean_over(cycles: np.float32) -> np.float32:
 
 @inlined
 def _bounded(side: float) -> np.float32:
-    """Return a side [tiles] that float32 can hold; over a longer one nothing is left of a wave."""
+    """Limit a side [tiles] to `LONGEST` for float32; over longer sides waves average to nothing."""
     return REAL(min(max(side, -LONGEST), LONGEST))
 
 
@@ -93,7 +93,7 @@ def mean_noise(waves: np.ndarray, terms: np.ndarray, s: float, q: float, sides: 
         weight *= _mean_over(along_s * other_s + along_q * other_q)
         turn = along_s * left + along_q * down + waves[2, k]
         terms[k] = waves[3, k] * weight * _cosine_of_turn(turn)
-    # Four sums that do not wait for each other.
+    # Four independent sums, which run in parallel.
     first = second = third = fourth = REAL(0.0)
     for k in range(0, WAVES, 4):
         first += terms[k]
@@ -112,7 +112,7 @@ def is_tabulated(noise: Noise, frame: Record) -> bool:
 
 @kernel
 def turn_waves(noise: Noise, frame: Record, mixing: Mixing) -> None:
-    """Turn the waves of the ground to where the eye is, if it is tabulated."""
+    """Shift the phases of the ground's waves to the eye's position, if the ground is tabulated."""
     if not is_tabulated(noise, frame):
         return
     look, turned = frame.ground_texture, mixing.turned
@@ -128,7 +128,7 @@ def turn_waves(noise: Noise, frame: Record, mixing: Mixing) -> None:
 
 @kernel
 def mix_ground(noise: Noise, mixing: Mixing, column: int) -> None:
-    """Fill the end of `mixing.means` with the means of the noise over a column's pixels of the ground."""
+    """Fill the end of `mixing.means` with the means of the noise over the ground pixels of a column."""
     table, turned = noise.ground[column], mixing.turned
     rows = table.shape[1]
     means = mixing.means[len(mixing.means) - rows :]
@@ -143,7 +143,7 @@ def mix_ground(noise: Noise, mixing: Mixing, column: int) -> None:
 def tabulate_ground(width: int, height: int, focal: float, eye_m: float, period_m: float) -> np.ndarray:
     """Return `Noise.ground` for a camera that looks along q from `eye_m` above the ground.
 
-    Empty where it would have more than `MAX_TABLE` numbers, or the eye is on the ground.
+    Empty if it would have more than `MAX_TABLE` numbers, or if the eye is on the ground.
     """
     rows = height // 2
     if eye_m <= 0.0 or width * rows * 2 * WAVES > MAX_TABLE:
@@ -155,9 +155,9 @@ def tabulate_ground(width: int, height: int, focal: float, eye_m: float, period_
 
 @numba.njit(cache=True, error_model="numpy")
 def _fill_ground(waves: np.ndarray, focal: float, eye: float, first: float, table: np.ndarray) -> None:
-    """Average each wave over each pixel, whose first row is `first` below the horizon; `eye` is in tiles.
+    """Average each wave over each ground pixel; row 0 is `first` rows below the horizon, `eye` in tiles.
 
-    A pixel is cut into parts of equal rows, on each of which depths are taken as evenly spread.
+    A pixel is cut into parts of equal height, in each of which depths are taken as evenly spread.
     """
     width, rows = table.shape[0], table.shape[2]
     table[:] = 0.0
@@ -177,7 +177,7 @@ def _fill_ground(waves: np.ndarray, focal: float, eye: float, first: float, tabl
 
 @kernel
 def _add_part(waves: np.ndarray, depth: float, long: float, u: float, wide: float, means: np.ndarray) -> None:
-    """Add the means of all waves over the ground around a depth, of slopes `wide` around `u`."""
+    """Add the means of all waves over the ground at `depth` +- `long` / 2 and at slopes `wide` around `u`."""
     for k in range(WAVES):
         cycles = waves[0, k] * u + waves[1, k]
         weight = _mean_over(REAL(waves[0, k] * depth * wide)) * _mean_over(REAL(cycles * long))

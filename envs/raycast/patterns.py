@@ -1,7 +1,7 @@
-"""Kernels that average patterns over the part of a surface that a row of a strip shows.
+"""Kernels that average patterns over the part of a surface that is visible in one row of a strip.
 
-What a row shows is taken as a parallelogram of the surface, of level faces as several. Over it noise,
-stripes and rings are averaged exactly, a checker where its sides lie along s and q. Input is
+This part is approximated by a parallelogram of the surface, on level faces by several. Over a parallelogram
+noise, stripes and rings are averaged exactly, a checker exactly if the sides are along s and q. Input is
 assumed valid.
 """
 
@@ -18,30 +18,30 @@ from envs.raycast.records import Canvas, Ends, Record
 from envs.scene import BOX
 from envs.scene.textures import NOISE, RINGS, STRIPES, TILE_PERIODS
 
-MIN_WIDTH = 1e-6  # [periods] a footprint below this is a point
-MIN_SIDE = 1e-4  # [periods] a side below this is left out beside another
-MIN_ROW = 1e-6  # [pixels] distance from the horizon up to which rows are told apart
-MAX_EDGES = 8  # of a pattern, at which a row is cut
+MIN_WIDTH = 1e-6  # [periods] a footprint below this counts as a point
+MIN_SIDE = 1e-4  # [periods] a side below this is left out if the other side is longer
+MIN_ROW = 1e-6  # [pixels] smallest distance of a row from the horizon
+MAX_EDGES = 8  # edges of a pattern at which a row is cut, at most
 MIN_SHOWN = 1e-9  # [pixels] weight below which a surface is not textured
 
 
 class Rows(NamedTuple):
-    """Range over which a pattern is averaged, in rows of the image."""
+    """Range of image rows over which a pattern is averaged."""
 
     first: float
     last: float
 
 
 class Upright(NamedTuple):
-    """Part of an upright surface that a strip shows [m].
+    """Part of an upright surface that is visible in a strip [m].
 
     Attributes:
-        s: Surface coordinate of its middle.
-        along: How much of s it shows.
-        swing: Mean of the pattern along s, if it is checker or stripes; no length.
-        q: The other coordinate, at the height of the eye.
-        depth: From the eye, on average.
-        lean: By how much its right end is deeper than its left.
+        s: Surface coordinate of the middle.
+        along: Length along s.
+        swing: Mean of the pattern along s, for checker and stripes; dimensionless.
+        q: The other surface coordinate, at the height of the eye.
+        depth: Mean depth from the eye.
+        lean: Depth of the right end minus depth of the left end.
     """
 
     s: float
@@ -72,7 +72,7 @@ def _bow(x: float) -> float:
 
 @kernel
 def _wave_between(middle: float, one: float, other: float) -> float:
-    """Mean of the square wave over a parallelogram whose sides span `one` and `other` [periods]; exact."""
+    """Return the mean of the square wave over a parallelogram of sides `one` and `other` [periods]; exact."""
     one, other = abs(one), abs(other)
     if min(one, other) < MIN_SIDE:
         return _wave(middle, max(one, other))
@@ -83,7 +83,7 @@ def _wave_between(middle: float, one: float, other: float) -> float:
 
 @inlined
 def _scaled(sides: Footprint, scale: float) -> Footprint:
-    """Return a footprint in another unit."""
+    """Return a footprint multiplied by `scale`."""
     return Footprint(sides.one_s * scale, sides.one_q * scale, sides.other_s * scale, sides.other_q * scale)
 
 
@@ -91,8 +91,8 @@ def _scaled(sides: Footprint, scale: float) -> Footprint:
 def mean_pattern(canvas: Canvas, look: Record, s: float, q: float, sides: Footprint) -> float:
     """Return contrast times the mean of a texture over the parallelogram around (s, q) [m].
 
-    Exact for noise, stripes and rings. A checker's coordinates are averaged each on its own, which is exact
-    if the footprint is a rectangle along s and q, or shows no edge of one of them.
+    Exact for noise, stripes and rings. A checker is averaged along s and q separately, which is exact if the
+    footprint is a rectangle along s and q, or if it has no edge along one of them.
     """
     time, scale = canvas.frame.time, look.frequency
     s = (s - look.speed_s * time) * scale
@@ -115,12 +115,12 @@ def mean_pattern(canvas: Canvas, look: Record, s: float, q: float, sides: Footpr
 def _level_row(canvas: Canvas, look: Record, rows: Rows, height: float, u: float, wide: float) -> float:
     """Return contrast times the mean of a texture of a level face at `height` [m] over some rows.
 
-    `u` and `wide` are the slope of the strip's middle and its width in slopes. Rows are cut where q is at an
-    edge of the pattern, as far as there are few.
+    `u` and `wide` are the slope of the strip's middle and its width in slopes. Rows are cut at the edges of
+    the pattern along q, if there are at most `MAX_EDGES`.
     """
     frame = canvas.frame
     drop = frame.focal * (frame.eye_z - height)
-    side = math.copysign(1.0, drop)  # of the horizon on which the face is seen
+    side = math.copysign(1.0, drop)  # 1 if the face appears below the horizon, -1 above
     low = side * max(MIN_ROW, side * (rows.first - frame.horizon))
     high = side * max(MIN_ROW, side * (rows.last - frame.horizon))
     steps = 2.0 * look.frequency * (u * frame.sin + frame.cos)  # edges of the pattern per depth
@@ -143,7 +143,7 @@ def _level_row(canvas: Canvas, look: Record, rows: Rows, height: float, u: float
 def _level_part(
     canvas: Canvas, look: Record, drop: float, low: float, high: float, u: float, wide: float
 ) -> float:
-    """Average between two rows below the horizon, in parts of equal rows where much is visible."""
+    """Average between two rows relative to the horizon, in several parts if they show many periods."""
     frame = canvas.frame
     along_s, along_q = u * frame.cos - frame.sin, u * frame.sin + frame.cos
     long = abs(drop / low - drop / high) * look.frequency
@@ -165,7 +165,7 @@ def _level_part(
 
 @inlined
 def _rows_between(row: int, top: Ends, bottom: Ends) -> Rows:
-    """Return first and last row of the part of a pixel that lies between the middles of two edges."""
+    """Return the range of rows of the part of a pixel row between the middles of two edges."""
     high, low = 0.5 * (top.left + top.right), 0.5 * (bottom.left + bottom.right)
     return Rows(min(max(high, row), low), max(min(low, row + 1.0), high))
 
@@ -224,10 +224,10 @@ def _upright_row(canvas: Canvas, look: Record, side: Upright, rows: Rows) -> flo
 def _add_upright_rows(
     canvas: Canvas, look: Record, side: Upright, first: int, last: int, weight: float
 ) -> None:
-    """Add `weight` times the pattern of an upright surface to rows that show nothing else; not noise.
+    """Add `weight` times the pattern of an upright surface to rows that show nothing else; not for noise.
 
-    The same as `_upright_row` for each of them, in a loop without branches: where the surface leans, over
-    a width of the same variance.
+    It replaces `_upright_row` for each row by a loop without branches. If the surface leans, the pattern is
+    averaged over an interval of the same variance as the parallelogram.
     """
     frame, paint, scale = canvas.frame, canvas.accumulators[Layer.PAINT], look.frequency
     weight *= look.contrast
@@ -257,12 +257,12 @@ def _swing(frame: Record, look: Record, s: float, along: float) -> float:
 
 @kernel
 def _swing_around(frame: Record, body: Record, strip: Record, s: float, along: float) -> float:
-    """Average around a pole, lit as the gap is, and cut at the pattern's edges if there are few."""
+    """Average the square wave around a pole, weighted by its light, cut at the edges if they are few."""
     look, left, right = frame.body_texture, strip.gap_slopes.left, strip.gap_slopes.right
     ahead = 2.0 * look.frequency
     begun = (s - 0.5 * along - look.speed_s * frame.time) * ahead
     ended = begun + along * ahead
-    # Edges within; one at the left end is passed already. Around a pole s rises from left to right.
+    # Edges inside, without one at the left end. Around a pole s increases from left to right.
     first, count = math.floor(begun) + 1, max(0, math.ceil(ended) - math.floor(begun) - 1)
     if count > MAX_EDGES or not right > left:
         return _swing(frame, look, s, along)
@@ -282,7 +282,7 @@ def _swing_around(frame: Record, body: Record, strip: Record, s: float, along: f
 
 @kernel
 def texture_cell(canvas: Canvas, u: float) -> None:
-    """Add the patterns of ground and walls to what the cell of slope `u` shows; not noise on the ground."""
+    """Add the patterns of ground and walls visible in the cell at slope `u`, except noise on the ground."""
     frame = canvas.frame
     whole = 1.0 / frame.samples
     if frame.ground_texture.contrast > 0.0 and frame.ground_texture.pattern != NOISE:
@@ -294,7 +294,7 @@ def texture_cell(canvas: Canvas, u: float) -> None:
 
 @kernel
 def texture_column(canvas: Canvas, u: float, column: int) -> None:
-    """Add noise to the ground that a column of pixels around slope `u` shows."""
+    """Add noise to the ground visible in a column of pixels around slope `u`."""
     frame = canvas.frame
     if frame.ground_texture.contrast > 0.0 and frame.ground_texture.pattern == NOISE:
         if is_tabulated(canvas.noise, frame):
@@ -304,7 +304,7 @@ def texture_column(canvas: Canvas, u: float, column: int) -> None:
 
 @kernel
 def _texture_ground(canvas: Canvas, u: float, whole: float) -> None:
-    """Add the pattern of the ground where it shows in what is `whole` pixels wide, around slope `u`."""
+    """Add the pattern of the ground visible in a width of `whole` pixels around slope `u`."""
     frame, look, paint = canvas.frame, canvas.frame.ground_texture, canvas.accumulators[Layer.PAINT]
     layers = canvas.accumulators[Layer.GROUND : Layer.GROUND + 3]
     mixed = look.pattern == NOISE and is_tabulated(canvas.noise, frame)
@@ -322,13 +322,13 @@ def _texture_ground(canvas: Canvas, u: float, whole: float) -> None:
 
 @kernel
 def _texture_wall(canvas: Canvas, layer: Layer, u: float, whole: float) -> None:
-    """Add the pattern of a wall where it shows in what is `whole` pixels wide, around slope `u`."""
+    """Add the pattern of a wall visible in a width of `whole` pixels around slope `u`."""
     frame, look, paint = canvas.frame, canvas.frame.wall_texture, canvas.accumulators[Layer.PAINT]
     layers = canvas.accumulators[layer : layer + 3]
     side = 1.0 if layer == Layer.RIGHT_WALL else -1.0
     base = frame.wall_albedo * (frame.lit_east if side * frame.wall_half < frame.eye_x else frame.lit_west)
     share = across = 0.0
-    first = last = -1  # of the rows that show nothing else
+    first = last = -1  # range of rows that show nothing else
     for row in range(int(2.0 * frame.horizon)):
         share += layers[0, row]
         across += layers[2, row]
@@ -348,15 +348,15 @@ def _texture_wall(canvas: Canvas, layer: Layer, u: float, whole: float) -> None:
 def _part(
     frame: Record, row: int, shown: tuple[float, float, float], u: float, whole: float
 ) -> tuple[Rows, float, float]:
-    """Return the visible part of a row as a rectangle of its area: rows, slope of the middle, width.
+    """Return the visible part of a row as a rectangle of the same area: rows, slope of its middle, width.
 
-    `shown` is the share of the row, and its moments down and across.
+    `shown` is the visible share of the row and its first moments down and across.
     """
     share, down, across = shown
     down /= share
     tall = 1.0 - 2.0 * abs(down)
     low = row + 0.5 + down - 0.5 * tall
-    # Where nothing hides a part of the row, all of it: sums have rounding errors.
+    # If nothing hides a part of the row, take all of it, because the sums have rounding errors.
     part, wide = min(1.0, share / max(whole * tall, MIN_SHOWN)), whole / frame.focal
     if part > 1.0 - MIN_SHOWN:
         return Rows(low, low + tall), u, wide
@@ -365,7 +365,7 @@ def _part(
 
 @inlined
 def _wall(frame: Record, side: float, u: float, wide: float) -> Upright:
-    """Return the part of the wall at x = side * half width that slopes `wide` around `u` show."""
+    """Return the part of the wall at x = side * half width that is visible in slopes `wide` around `u`."""
     away = side * frame.wall_half - frame.eye_x
     left, right = u - 0.5 * wide, u + 0.5 * wide
     one = away / (left * frame.cos - frame.sin)
@@ -381,7 +381,7 @@ def _wall(frame: Record, side: float, u: float, wide: float) -> Upright:
 
 @kernel
 def _along_face(frame: Record, body: Record, strip: Record) -> Upright:
-    """Return the coordinate along the visible face of a box: y (x) if the face looks along x (y)."""
+    """Return the part of a box's face visible in the gap; s is y if the face's normal is along x, else x."""
     cos, sin, left, right = frame.cos, frame.sin, strip.gap_slopes.left, strip.gap_slopes.right
     along_x, along_y = strip.slope * cos - sin, strip.slope * sin + cos
     near_x, near_y, _ = box_slab(body, along_x, along_y)
@@ -402,7 +402,7 @@ def _along_face(frame: Record, body: Record, strip: Record) -> Upright:
 
 @kernel
 def _around_pole(frame: Record, body: Record, strip: Record) -> Upright:
-    """Return the side of a pole that the gap shows."""
+    """Return the part of a pole's side visible in the gap."""
     left, right = strip.gap_slopes.left, strip.gap_slopes.right
     near, _ = depths(body, frame, left)
     middle, _ = depths(body, frame, strip.slope)

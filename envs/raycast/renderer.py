@@ -2,14 +2,13 @@
 
 The camera only yaws, so one image column is one horizontal direction and every body covers
 an interval of its rows, known in closed form. A column is therefore composed exactly, from
-near to far. Pixel columns are cut at each silhouette; the pixel is the mean over its area (a
-box filter), exact in v, and in u for straight edges and for the arcs of round outlines up to
-their curvature within a strip. Textures are averaged over what a row shows of a surface: in a strip of a
-body, in a cell of the ground or a wall, in a whole column of the ground's noise.
+near to far. Pixel columns are cut at each silhouette. A pixel is the mean over its area (a
+box filter), exact in v, and in u exact for straight edges and for the arcs of round outlines up
+to their curvature within a strip. Textures are averaged over the visible part of a surface in a row: per
+strip for a body, per cell for the ground or a wall, per whole column for noise on the ground.
 
-Rules where geometry leaves a choice: what is seen from behind is invisible (a body from its
-inside, a wall from within its plane); bodies do not overlap, though one may float over
-another.
+Surfaces are invisible from behind: a body from its inside, a wall from within its plane. Bodies
+do not overlap, though one may float over another.
 """
 
 import math
@@ -33,7 +32,7 @@ def _check_scene(scene: Scene) -> None:
 
 
 def _make_bodies(scene: Scene) -> np.ndarray:
-    """Return the obstacles, (M,) BODY, as far as they stand above the ground; those that move come last."""
+    """Return the parts of obstacles above the ground, (M,) BODY; moving bodies come last."""
     o = scene.obstacles[scene.obstacles["z"] + scene.obstacles["rz"] > 0.0]
     o = np.concatenate([o, bodies_at(scene.movers, 0.0)]) if scene.movers else o
     bottom, top = o["z"] - o["rz"], o["z"] + o["rz"]
@@ -51,7 +50,7 @@ def _make_bodies(scene: Scene) -> np.ndarray:
 
 
 def _make_frame(scene: Scene, height: int, focal: float, samples: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return a FRAME (1,) without the fields of a pose, and the waves of the scene's noise."""
+    """Return a FRAME (1,) without the fields that depend on the pose, and the waves of the scene's noise."""
     frame = np.zeros(1, FRAME)
     faces = np.array([(0, 0, 1), (0, 0, -1), (1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0)], np.float64)
     lit = scene.shade(np.ones(6), faces).tolist()
@@ -76,7 +75,7 @@ def _make_frame(scene: Scene, height: int, focal: float, samples: int) -> tuple[
 
 
 def _texture_record(texture: Texture, noise: int) -> tuple[float, ...]:
-    """Return a TEXTURE record; `noise` is the place of its waves, if it is noise."""
+    """Return the values of a TEXTURE record; `noise` is the index of its waves, if it is noise."""
     kind = PATTERNS.index(texture.pattern)
     return (kind, 1.0 / texture.period_m, texture.depth, *texture.velocity_mps, noise)
 
@@ -87,12 +86,12 @@ def focal_length(width: int, fov_deg: float) -> float:
 
 
 class RaycastRenderer:
-    """Renders one scene after the other; its only state is the scene and the shape of the image.
+    """Renderer of one scene at a time; its only state is the scene and the shape of the image.
 
     Attributes:
         bodies: (N,) BODY, the obstacles, see `envs.raycast.records`.
-        frame: (1,) FRAME without what a pose determines.
-        noise: Of the scene.
+        frame: (1,) FRAME without the fields that depend on the pose.
+        noise: Noise textures of the scene.
         room: `envs.raycast.columns.Workspace` of this scene.
     """
 
@@ -109,19 +108,19 @@ class RaycastRenderer:
         """Make a renderer of `width` x `height` square pixels with a horizontal field of view of `fov_deg`.
 
         Args:
-            scene: What to draw.
+            scene: The scene to draw.
             width: Columns of the image.
             height: Rows of the image.
             fov_deg: Horizontal field of view [degrees].
-            samples: Strips into which each column of pixels is cut, besides the cuts at
-                silhouettes.
+            samples: Number of strips into which each column of pixels is cut, in addition to the
+                cuts at silhouettes.
             cull_m: Bodies whose nearest point is farther than this are not drawn [m].
-            discs: Whether spheres are drawn pixel by pixel, in samples^2 parts of each, by
-                `envs.raycast.discs`.
+            discs: Whether `envs.raycast.discs` draws spheres pixel by pixel, in samples^2 parts of
+                each pixel.
 
         Raises:
-            ValueError: If a size is not at least 1, fov_deg not in [1, 170], cull_m not
-                positive, or the scene holds what this renderer cannot draw.
+            ValueError: A size is not at least 1, fov_deg not in [1, 170], cull_m not
+                positive, or the scene has something that this renderer cannot draw.
         """
         check_image(width, height, fov_deg, samples, cull_m)
         self.width, self.height, self.fov_deg, self.samples = width, height, fov_deg, samples
@@ -129,7 +128,7 @@ class RaycastRenderer:
         self.set_scene(scene)
 
     def set_scene(self, scene: Scene) -> None:
-        """Draw `scene` from now on. Raises ValueError if it holds what this renderer cannot draw."""
+        """Draw `scene` from now on. Raises ValueError if it has something that this renderer cannot draw."""
         _check_scene(scene)
         self.bodies = _make_bodies(scene)
         focal = focal_length(self.width, self.fov_deg)
@@ -140,12 +139,12 @@ class RaycastRenderer:
         self._moving = scene.movers
 
     def move_bodies(self, moving: Sequence[MovingBody], start_s: float, end_s: float) -> None:
-        """Let the bodies that move go straight from where they are at a time to where they are at another.
+        """Move the moving bodies straight from their places at `start_s` to their places at `end_s`.
 
         Args:
-            moving: As many as the scene has.
-            start_s: When they are where the path says [s].
-            end_s: When they are there again, later; at the same time: they rest [s].
+            moving: The bodies with their paths, as many as the scene has.
+            start_s: Time of their first places [s].
+            end_s: Time of their last places [s]; equal to `start_s`: the bodies rest.
         """
         own = self.bodies[len(self.bodies) - len(moving) :]
         before, after = bodies_at(moving, start_s), bodies_at(moving, end_s)
@@ -157,9 +156,9 @@ class RaycastRenderer:
         own["bottom"][own["kind"] != ELLIPSOID] = own["bottom"][own["kind"] != ELLIPSOID].clip(0.0)
 
     def expect_height(self, eye_m: float) -> None:
-        """Expect to look along +y from `eye_m` above the ground [m]: noise on the ground then costs little.
+        """Prepare for a camera at height `eye_m` [m] that looks along +y: noise on the ground is then cheap.
 
-        Images from elsewhere are the same as without. Of both kinds the noise of the ground is right to a
+        Other poses are rendered as without this call. In both cases the noise of the ground is accurate to a
         fiftieth of its amplitude (tests/envs/raycast/test_noise.py).
 
         Raises:
@@ -167,7 +166,7 @@ class RaycastRenderer:
         """
         if not 0.0 <= eye_m < math.inf:
             raise ValueError(f"eye_m must be finite and >= 0; got {eye_m!r}.")
-        eye_m, texture = float(eye_m), self._ground_texture  # another type would compile all again
+        eye_m, texture = float(eye_m), self._ground_texture  # another type would recompile the kernels
         if texture.pattern == "noise" and not texture.plain:
             table = tabulate_ground(
                 self.width, self.height, focal_length(self.width, self.fov_deg), eye_m, texture.period_m
@@ -184,31 +183,31 @@ class RaycastRenderer:
             y_m: Position forward [m].
             z_m: Height above the ground [m], >= 0.
             yaw_rad: Heading, 0 along +y, counter-clockwise seen from above [rad].
-            t_s: Time [s], which moves textures and bodies; finite.
+            t_s: Time [s], which decides where textures and bodies are; finite.
 
         Returns:
             (height, width) float32 linear luminance, row 0 on top.
 
         Raises:
-            ValueError: If the pose or time is not finite, or the pose below the ground or
-                farther than 1000 km.
+            ValueError: The pose or time is not finite, or the pose is below the ground or farther
+                than 1000 km.
         """
         if self._moving and math.isfinite(t_s):
             self.move_bodies(self._moving, t_s, t_s)
         return self.render_way(np.array([[x_m, y_m, z_m, yaw_rad, t_s]], np.float64))[0]
 
     def render_way(self, poses: np.ndarray) -> np.ndarray:
-        """Render the images along a way in one call; bodies move as `move_bodies` said last.
+        """Render the images along a way in one call; bodies move as in the last call of `move_bodies`.
 
         Args:
-            poses: float64 (K, 5), of each image what `render` takes: x, y, z [m], yaw [rad]
-                and time [s].
+            poses: float64 (K, 5), the arguments of `render` for each image: x, y, z [m], yaw
+                [rad] and time [s].
 
         Returns:
             (K, height, width) float32 linear luminance.
 
         Raises:
-            ValueError: As `render`, for the first pose that is refused.
+            ValueError: As for `render`, for the first invalid pose.
         """
         columns = np.empty((len(poses), self.width, self.height), np.float32)
         bad = render_way(self.bodies, self.noise, self.frame, poses, columns, self.cull_m, self.room)

@@ -1,8 +1,8 @@
 """Times at which silhouettes cross the borders between columns of pixels on a straight way.
 
 While a silhouette moves within one column, the light of the column's pixels changes almost
-linearly; when it passes into the next, one column stops changing and the other begins. So these
-are the moments at which a column has to be looked at.
+linearly. When it passes into the next column, the first stops changing and the next one starts.
+So these are the moments at which a column has to be rendered.
 """
 
 import math
@@ -16,22 +16,22 @@ from envs.raycast.columns import Workspace, aim
 from envs.raycast.records import Record
 from envs.scene import BOX
 
-BESIDE = 2.0  # columns beside the image in which silhouettes are followed too
-MOVING = 0.2  # columns; a silhouette that moves farther is looked at once more, half-way
-MIN_MOVE = 1e-9  # columns
-NEARBY = 1e-6  # [m] more than any rounding of distances
-LOOKS_PER_COLUMN = 4  # at most, on average over the image; beyond it silhouettes cross unseen
+BESIDE = 2.0  # [columns] margin beside the image in which silhouettes are followed too
+MOVING = 0.2  # [columns] a silhouette that moves farther gets one more look, half-way
+MIN_MOVE = 1e-9  # [columns] smallest motion of a silhouette that counts
+NEARBY = 1e-6  # [m] more than any rounding error of distances
+LOOKS_PER_COLUMN = 4  # most looks on average over the image; crossings beyond it get no look
 
 
 class Way(NamedTuple):
     """A straight way at constant speed; the camera looks along +y.
 
     Attributes:
-        start_x, start_y: Where it begins [m].
-        end_x, end_y: Where it ends [m].
-        height: Of the camera above the ground [m].
-        start_us: When it begins [us].
-        moving_us: How long it takes, >= 1 [us].
+        start_x, start_y: Start of the way [m].
+        end_x, end_y: End of the way [m].
+        height: Height of the camera above the ground [m].
+        start_us: Start time [us].
+        moving_us: Duration, >= 1 [us].
     """
 
     start_x: float
@@ -44,13 +44,13 @@ class Way(NamedTuple):
 
 
 class Stretch(NamedTuple):
-    """A part of a way, in which outlines move little.
+    """A part of a way in which outlines move little.
 
     Attributes:
-        number: Which one it is, from 1 on.
-        begin_us, end_us: When it begins and ends [us].
-        followed: (K,) int64, the bodies in view, `follow_bodies`.
-        before, after: (K, 2), their silhouettes at its begin and at its end, `find_silhouettes`.
+        number: Number of the stretch in its way, from 1.
+        begin_us, end_us: Start and end time [us].
+        followed: (K,) int64, numbers of the bodies in view, from `follow_bodies`.
+        before, after: (K, 2), their silhouettes at start and end, from `find_silhouettes`.
     """
 
     number: int
@@ -65,11 +65,11 @@ class Looks(NamedTuple):
     """Times and columns of the looks of a stretch.
 
     Attributes:
-        t_us: Times, int64 [us].
+        t_us: Time of each look, int64 [us].
         first: First column of each look, int64.
-        last: The column after its last one, int64.
-        moving: Of each column of the image, whether a silhouette moves fast in it, bool.
-        every: After how many stretches each column of the image is looked at in any case, int64.
+        last: The column after the last column of each look, int64.
+        moving: Whether a silhouette moves fast in each column of the image, bool.
+        every: Number of stretches after which each column of the image is rendered in any case, int64.
     """
 
     t_us: np.ndarray
@@ -103,14 +103,14 @@ def follow_bodies(
 
     Args:
         bodies: (N,) BODY.
-        way: The way; what is in view only between its ends is not found.
-        focal: Of the camera [pixels].
+        way: The way; bodies in view only between its ends are not found.
+        focal: Focal length of the camera [pixels].
         width: Columns of the image.
-        cull: Bodies farther than this are not seen [m].
-        numbers: (N,) int64, whose first elements become theirs, in ascending order.
+        cull: Bodies farther than this are left out [m].
+        numbers: (N,) int64, whose first elements become the numbers of these bodies, in ascending order.
 
     Returns:
-        How many there are.
+        The number of bodies found.
     """
     limit, count = (0.5 * width + BESIDE) / focal, 0
     slack = math.sqrt(1.0 + limit * limit)
@@ -119,7 +119,7 @@ def follow_bodies(
         reach = body.rx if body.kind != BOX else math.hypot(body.rx, body.ry)
         for end in range(2):
             x, y = (way.end_x, way.end_y) if end else (way.start_x, way.start_y)
-            if body.moves:  # as seen from where the body was noted
+            if body.moves:  # move the camera instead of the body
                 late = (way.start_us + end * way.moving_us) * 1e-6 - body.since
                 x, y = x - body.vx * late, y - body.vy * late
             beside, forward = abs(body.x - x), body.y - y
@@ -133,18 +133,18 @@ def follow_bodies(
 
 @kernel
 def find_near(bodies: np.ndarray, way: Way, focal: float, width: int, cull: float, near: np.ndarray) -> int:
-    """Collect the bodies that can be in view anywhere on a way; the others need not be asked at each look.
+    """Collect the bodies that can be in view anywhere on a way; each look needs to consider only these.
 
     Args:
         bodies: (N,) BODY.
         way: The way.
-        focal: Of the camera [pixels].
+        focal: Focal length of the camera [pixels].
         width: Columns of the image.
-        cull: Bodies farther than this are not seen [m].
-        near: (N,) BODY, whose first elements become these bodies, in their order.
+        cull: Bodies farther than this are left out [m].
+        near: (N,) BODY, whose first elements become these bodies, in the same order.
 
     Returns:
-        How many there are.
+        The number of bodies found.
     """
     limit, count = 0.5 * width / focal, 0
     slack = math.sqrt(1.0 + limit * limit)
@@ -172,11 +172,11 @@ def find_silhouettes(
 
     Args:
         bodies: (N,) BODY.
-        followed: (K,) int64, which of them.
+        followed: (K,) int64, numbers of the bodies to look for.
         width: Columns of the image.
         room: A `Workspace`.
-        places: (K, 2) float64, becomes the column of the left and the right silhouette of each [pixels]; next
-            to the image where it is out of view or infinite, as beside a body.
+        places: (K, 2) float64, filled with the columns of each body's left and right silhouette [pixels].
+            Silhouettes out of view or at infinity (the eye is beside the body) are put next to the image.
     """
     frame, half = room.frames[0], 0.5 * width
     for k in range(len(followed)):
@@ -190,23 +190,23 @@ def find_silhouettes(
 
 @inlined
 def near(place: float, size: float) -> float:
-    """Return a place, moved next to an image of `size` pixels if it is farther outside."""
+    """Limit a place to an image of `size` pixels and a margin of `BESIDE` around it."""
     return min(max(place, -BESIDE), size + BESIDE)
 
 
 @kernel
 def find_looks(bodies: np.ndarray, focal: float, way: Way, stretch: Stretch, looks: Looks) -> int:
-    """Find the looks of a stretch of a way, sorted by time; looks at its end by column.
+    """Find the looks of a stretch of a way, sorted by time; looks at its end are sorted by column.
 
     Args:
         bodies: (N,) BODY.
-        focal: Of the camera [pixels].
+        focal: Focal length of the camera [pixels].
         way: The whole way.
-        stretch: The part of it.
-        looks: Filled with the looks; those beyond its room are left out.
+        stretch: The stretch of the way.
+        looks: Filled with the looks; looks beyond its room are left out.
 
     Returns:
-        How many there are.
+        The number of looks.
     """
     before, after, width = stretch.before, stretch.after, len(looks.moving)
     size, half_way_us = 0, (stretch.begin_us + stretch.end_us) // 2
@@ -227,7 +227,7 @@ def find_looks(bodies: np.ndarray, focal: float, way: Way, stretch: Stretch, loo
 
 @inlined
 def _look_at_end(stretch: Stretch, looks: Looks, size: int) -> int:
-    """Append the looks at the columns that are due at the end of a stretch; return the new number."""
+    """Append the looks at the columns due at the end of a stretch; return the new number of looks."""
     due, width = False, len(looks.every)
     for column in range(width):
         before, due = due, stretch.number % looks.every[column] == 0
@@ -241,7 +241,7 @@ def _look_at_end(stretch: Stretch, looks: Looks, size: int) -> int:
 
 @inlined
 def _look_at_moving(stretch: Stretch, looks: Looks, t_us: int) -> int:
-    """Start with looks at the columns in which a silhouette moves far; return their number."""
+    """Start with the looks at the columns in which a silhouette moves far; return the number of looks."""
     before, after, moving, width = stretch.before, stretch.after, looks.moving, len(looks.moving)
     moving[:] = False
     for i in range(len(before)):
@@ -263,9 +263,10 @@ def _look_at_moving(stretch: Stretch, looks: Looks, t_us: int) -> int:
 
 @inlined
 def _crossing(body: Record, side: int, u: float, way: Way) -> float:
-    """Return when the left or right silhouette of a body is at slope `u` [us]; not finite if it never is.
+    """Return the time when the left or right silhouette of a body is at slope `u` [us]; not finite if never.
 
-    There the ray touches the body: its distance from the axis, which is linear in time, is the body's reach.
+    At that time the ray touches the body: the axis's offset from the ray, linear in time, equals the body's
+    reach.
     """
     moved = way.end_x - way.start_x - u * (way.end_y - way.start_y)
     away = body.x - way.start_x - u * (body.y - way.start_y)
@@ -279,7 +280,7 @@ def _crossing(body: Record, side: int, u: float, way: Way) -> float:
 
 @inlined
 def _add_look(looks: Looks, size: int, t_us: int, first: int, last: int) -> int:
-    """Add a look, sorted by time; return the new number."""
+    """Insert a look in the order of time; return the new number of looks."""
     j = size
     while j > 0 and looks.t_us[j - 1] > t_us:
         looks.t_us[j], looks.first[j], looks.last[j] = (

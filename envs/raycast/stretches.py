@@ -1,7 +1,7 @@
-"""Cut a way into so many stretches of time that a column's contents move little in each.
+"""Cut a way into stretches of time that are short enough for a column's contents to move little in each.
 
-Silhouettes have looks of their own (`envs.raycast.silhouettes`). This file counts for what crosses rows:
-the tops and feet of bodies and of walls, slanted outlines, and the patterns on them.
+Silhouettes get their own looks (`envs.raycast.silhouettes`). This file handles motion across rows: of tops
+and feet of bodies and walls, of slanted outlines, and of the patterns on them.
 """
 
 import math
@@ -17,19 +17,19 @@ from envs.raycast.silhouettes import BESIDE, Looks, Way, near
 from envs.scene import BOX, POLE
 from envs.scene.textures import NOISE
 
-MAX_STRETCHES = 16  # of one column in a part of a way
-SIGHTS = (0.125, 0.5, 0.875)  # of a body: at which parts of what is in view of it its rows are measured
-ROWS = 5  # at each: of its top, its side, its underside, its end; and the logarithm of its depth
-PATTERN = 4.0  # times as far as a level outline may a pattern on a body move
+MAX_STRETCHES = 16  # per column in a part of a way
+SIGHTS = (0.125, 0.5, 0.875)  # fractions of a body's visible width at which its rows are measured
+ROWS = 5  # numbers at each sight: rows of top, side, underside and end, and the logarithm of the depth
+PATTERN = 4.0  # allowed motion of a pattern on a body, over the allowed motion of a level outline
 
 
 class Shifts(NamedTuple):
     """Largest motion of a body's outline between two looks at its columns, by kind of edge [pixels].
 
     Attributes:
-        upright: Of a pole, or a box on the ground.
-        level: Of a box above the ground, of all tops and feet, and of walls.
-        bent: Of a cone or an ellipsoid.
+        upright: For poles and for boxes on the ground.
+        level: For boxes above the ground, for all tops and feet, and for walls.
+        bent: For cones and ellipsoids.
     """
 
     upright: float
@@ -41,9 +41,9 @@ class Outlines(NamedTuple):
     """Image positions of the followed bodies at two places of a way.
 
     Attributes:
-        followed: (N,) int64, the numbers of the bodies; the first K elements are in use, as below.
-        before, after: (N, 2), their silhouettes, `silhouettes.find_silhouettes`.
-        rows_before, rows_after: (N, R), their rows, `find_rows`.
+        followed: (N,) int64, the numbers of the bodies. Of this and the other arrays the first K are in use.
+        before, after: (N, 2), silhouettes of the bodies, from `silhouettes.find_silhouettes`.
+        rows_before, rows_after: (N, R), rows of the bodies, from `find_rows`.
     """
 
     followed: np.ndarray
@@ -69,17 +69,17 @@ def find_rows(
     room: Workspace,
     rows: np.ndarray,
 ) -> None:
-    """Find the rows in which near bodies show, as seen by `room.frames[0]`.
+    """Find the image rows of near bodies, as seen by `room.frames[0]`.
 
     Args:
         bodies: (N,) BODY.
-        followed: (K,) int64, which of them.
+        followed: (K,) int64, numbers of the bodies to look for.
         width: Columns of the image.
-        way: The way that is cut.
-        shifts: How far outlines may move in a stretch of it.
+        way: The way to cut.
+        shifts: Largest motion of outlines in a stretch.
         room: A `Workspace`.
-        rows: (N, 3 * ROWS) float64, becomes the rows of each [pixels] and the logarithms of their depths [m];
-            nan for what is out of view, or so far that no row of it in the image moves by more than that.
+        rows: (N, 3 * ROWS) float64, filled with each body's rows [pixels] and the logarithms of its depths
+            [m]; nan if it is out of view, or so far that none of its rows moves by more than `shifts`.
     """
     frame = room.frames[0]
     limit = (0.5 * width + BESIDE) / frame.focal
@@ -130,17 +130,17 @@ def divide_time(
     limit: int,
     looks: Looks,
 ) -> int:
-    """Cut a time into so many stretches that outlines move little in each; mark columns that need them all.
+    """Choose the number of stretches, so that outlines move little in each, and the looks of each column.
 
     Args:
         bodies: (N,) BODY.
-        count: How many of them are followed.
-        outlines: Theirs at the begin and at the end of the way.
+        count: Number of followed bodies.
+        outlines: Outlines of the followed bodies at the start and at the end of the way.
         way: The way.
-        frame: Of a camera on it.
-        shifts: How far outlines may move in a stretch.
-        limit: How many stretches there may be, if that is less than `MAX_STRETCHES`.
-        looks: Their `every` is filled.
+        frame: FRAME of a camera on the way.
+        shifts: Largest motion of outlines in a stretch.
+        limit: Largest number of stretches, if less than `MAX_STRETCHES`.
+        looks: `Looks` whose `every` is filled: the stretches between two looks at each column.
 
     Returns:
         The number of stretches, a power of two.
@@ -169,7 +169,7 @@ def divide_time(
 
 @inlined
 def _stretches(moved: float, limit: int) -> int:
-    """Return the least power of two >= `moved`, a motion in multiples of the allowed one; at most `limit`."""
+    """Return the smallest power of two >= `moved`, the motion over the allowed motion; at most `limit`."""
     stretches = 1
     while moved > stretches and 2 * stretches <= limit:
         stretches *= 2
@@ -178,7 +178,7 @@ def _stretches(moved: float, limit: int) -> int:
 
 @inlined
 def _moved(body: Record, k: int, outlines: Outlines, way: Way, frame: Record, shifts: Shifts) -> float:
-    """Return the motion of a body's outline in multiples of the motion allowed in a stretch."""
+    """Return the motion of a body's outline over the motion allowed in a stretch."""
     shift = _shift_of(body, shifts)
     level, moved = min(shift, shifts.level), 0.0
     for side in range(2):
@@ -195,7 +195,7 @@ def _moved(body: Record, k: int, outlines: Outlines, way: Way, frame: Record, sh
 
 @inlined
 def _pattern_moved(before: np.ndarray, after: np.ndarray, way: Way, frame: Record) -> float:
-    """Return how far the pattern on a body moves in the image rows that the body covers [pixels]."""
+    """Return the motion of the pattern on a body within the rows that the body covers [pixels]."""
     reach = max(abs(before[0] - frame.horizon), abs(before[ROWS - 2] - frame.horizon))
     texture = frame.body_texture
     alone_m = math.hypot(texture.speed_s, texture.speed_q) * way.moving_us * 1e-6
@@ -212,7 +212,7 @@ def _shift_of(body: Record, shifts: Shifts) -> float:
 
 @inlined
 def _wall_moved(u: float, way: Way, frame: Record) -> float:
-    """Return how far the upper and lower line of the wall seen along slope `u` move [pixels]."""
+    """Return the largest motion of the wall's upper and lower line and pattern along slope `u` [pixels]."""
     wall = math.copysign(frame.wall_half, u)
     before, after = (wall - way.start_x) * u, (wall - way.end_x) * u
     if before <= 0.0 or after <= 0.0:  # straight ahead, or from beyond a wall

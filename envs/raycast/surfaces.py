@@ -1,7 +1,8 @@
-"""Kernels that show a wall or a body in one strip: clip it to the gaps, paint it, close them.
+"""Kernels that paint a wall or a body into one strip: clip it to the gaps, paint it, close the gaps.
 
-A strip's gaps are what nothing nearer covers, each between two straight edges. What is shown is
-clipped to gaps at both ends, so that it and the gaps always part the strip. Input is assumed valid.
+A strip's gaps are the parts that nothing nearer covers, each between two straight edges. A surface is
+clipped to the gaps at both ends, so that painted areas and gaps always add up to the strip. Input is
+assumed valid.
 """
 
 import math
@@ -16,12 +17,12 @@ from envs.raycast.records import Canvas, Ends, Record
 from envs.scene import BOX, ELLIPSOID, POLE
 
 MIN_CROSSING = 0.02  # [rows] edges that cross by less are not cut there
-MAX_SHARE = 0.1  # [widths of a body] a strip wider than this is lit by two points
+MAX_SHARE = 0.1  # [widths of a body] a strip of a textured pole wider than this is halved
 
 
 @kernel
 def wall_depth(frame: Record, side: float, u: float) -> float:
-    """Return the depth at which slope `u` meets the wall at x = side * half width [m]; inf: never."""
+    """Return the depth at which slope `u` meets the wall at x = side * half width [m]; inf if never."""
     depth = (side * frame.wall_half - frame.eye_x) / (u * frame.cos - frame.sin)
     y = frame.eye_y + depth * (u * frame.sin + frame.cos)
     return depth if depth > MIN_DEPTH and frame.wall_near <= y <= frame.wall_far else math.inf
@@ -29,14 +30,14 @@ def wall_depth(frame: Record, side: float, u: float) -> float:
 
 @inlined
 def _in_gap(gap: Record, edge: Record) -> Ends:
-    """Return an edge of the surface at both ends of a gap."""
+    """Return the rows of a surface's edge at both ends of a gap."""
     left, right = edge.left, edge.right
     return Ends(left + gap.reach.left * (right - left), right + (1.0 - gap.reach.right) * (left - right))
 
 
 @inlined
 def _clip(gap: Record, edge: Record) -> Ends:
-    """Return an edge of the surface, moved into a gap."""
+    """Return an edge of a surface, clipped to a gap."""
     left, right = beyond(_in_gap(gap, edge), ends(gap.top))
     left, right = beyond(Ends(-left, -right), Ends(-gap.bottom.left, -gap.bottom.right))
     return Ends(-left, -right)
@@ -44,7 +45,7 @@ def _clip(gap: Record, edge: Record) -> Ends:
 
 @inlined
 def _cut_gaps(gaps: np.ndarray, strip: Record, count: int) -> int:
-    """Cut the gaps where an edge of the surface crosses one of theirs; return their new number."""
+    """Cut the gaps where an edge of the surface crosses an edge of a gap; return the new number of gaps."""
     count = _cut_by(gaps, strip.cap, count)
     count = _cut_by(gaps, strip.end, count)
     if strip.side.left > strip.cap.left or strip.side.right > strip.cap.right:
@@ -56,7 +57,7 @@ def _cut_gaps(gaps: np.ndarray, strip: Record, count: int) -> int:
 
 @kernel
 def _cut_by(gaps: np.ndarray, edge: Record, count: int) -> int:
-    """Cut the gaps where one edge crosses theirs, as long as less than half the room is used."""
+    """Cut the gaps where an edge crosses their edges, as long as less than half the room is used."""
     k = 0
     while k < count:
         count = _cut_at(gaps, k, edge, gaps[k].top, count)
@@ -67,7 +68,7 @@ def _cut_by(gaps: np.ndarray, edge: Record, count: int) -> int:
 
 @inlined
 def _cut_at(gaps: np.ndarray, k: int, edge: Record, limit: Record, count: int) -> int:
-    """Cut gap `k` where an edge crosses one of its own, `limit`; the new number of gaps."""
+    """Cut gap `k` where an edge crosses the gap's edge `limit`; return the new number of gaps."""
     left, right = _in_gap(gaps[k], edge)
     one, other = left - limit.left, right - limit.right
     if one * other < 0.0 and min(abs(one), abs(other)) > MIN_CROSSING and 2 * count < len(gaps):
@@ -78,7 +79,7 @@ def _cut_at(gaps: np.ndarray, k: int, edge: Record, limit: Record, count: int) -
 
 @inlined
 def enter_gap(frame: Record, strip: Record, gap: Record) -> None:
-    """Store the place and the weight of a gap in the strip."""
+    """Store the slopes and the width of a gap in the strip."""
     first, wide = strip.slopes.left, strip.slopes.right - strip.slopes.left
     left, right = first + gap.reach.left * wide, first + gap.reach.right * wide
     put(strip.gap_slopes, Ends(left, right))
@@ -93,9 +94,9 @@ def _is_same(one: Record, other: Record) -> bool:
 
 @kernel
 def _carve(canvas: Canvas, count: int, k: int, first: Ends, last: Ends, standing: bool) -> int:
-    """Remove the surface, from edge `first` to `last`, from gap `k`.
+    """Remove a painted surface, from edge `first` to `last`, from gap `k`; return the new number of gaps.
 
-    Below what stands on the ground only the ground is left.
+    Below a surface that is `standing` on the ground only ground is visible, so that part of the gap closes.
     """
     frame, strip, gaps = canvas.frame, canvas.strip, canvas.gaps
     gap = gaps[k]
@@ -157,7 +158,7 @@ def show_walls(canvas: Canvas, count: int, limit: float) -> int:
 
 @kernel
 def _lit_part(frame: Record, body: Record, strip: Record) -> float:
-    """Return the mean cosine over a strip that the sun lights up to where its rays graze the pole."""
+    """Return the mean cosine over a strip of a pole that is lit only up to where the sun's rays graze it."""
     length = math.sqrt(frame.sun_right * frame.sun_right + frame.sun_forward * frame.sun_forward)
     right, forward = -frame.sun_forward / length, frame.sun_right / length
     away = right * body.right + forward * body.forward
@@ -172,7 +173,7 @@ def _lit_part(frame: Record, body: Record, strip: Record) -> float:
 
 @inlined
 def _side_light(frame: Record, body: Record, strip: Record) -> float:
-    """Return the mean luminance of a pole's or box's side over the strip."""
+    """Return the mean luminance of the side of a pole or box over the strip."""
     middle = 0.5 * (strip.slopes.left + strip.slopes.right)
     if body.kind == POLE:
         one, other = strip.cosine.left, strip.cosine.right
@@ -190,13 +191,13 @@ def _side_light(frame: Record, body: Record, strip: Record) -> float:
 
 @inlined
 def _is_curved(body: Record) -> bool:
-    """Whether a body's side bends along a column, so that each row has a light of its own."""
+    """Whether a body's side is curved along a column, so that each row has its own luminance."""
     return body.kind != POLE and body.kind != BOX
 
 
 @kernel
 def _cut_for_body(canvas: Canvas, body: Record, count: int) -> int:
-    """Cut the gaps where a body's edges cross theirs, and in two for a pattern that bends around a pole."""
+    """Cut the gaps where a body's edges cross their edges, and in two for a pattern around a wide pole."""
     gaps, strip = canvas.gaps, canvas.strip
     count = _cut_gaps(gaps, strip, count)
     broad = strip.slopes.right - strip.slopes.left > MAX_SHARE * (body.high - body.low)
@@ -226,7 +227,7 @@ def _paint_faces(canvas: Canvas, body: Record, top: Ends, first: Ends, last: End
 
 @inlined
 def _light_gap(frame: Record, body: Record, strip: Record, mean: float) -> None:
-    """Store the light and tilt of a pole in the gap; `mean` is the light of the whole strip."""
+    """Store a pole's luminance in the gap and its tilt; `mean` is the luminance over the whole strip."""
     first, last = strip.slopes.left, strip.slopes.right
     left = body.albedo * (frame.ambient + frame.diffuse * max(0.0, strip.cosine.left))
     right = body.albedo * (frame.ambient + frame.diffuse * max(0.0, strip.cosine.right))
@@ -238,7 +239,7 @@ def _light_gap(frame: Record, body: Record, strip: Record, mean: float) -> None:
 
 @inlined
 def show_body(canvas: Canvas, body: Record, count: int) -> int:
-    """Paint a body, whose rows the strip holds, into the gaps; return their new number."""
+    """Paint a body, whose rows are in the strip, into the gaps; return the new number of gaps."""
     frame, strip, gaps = canvas.frame, canvas.strip, canvas.gaps
     strip.light = 0.0 if _is_curved(body) else _side_light(frame, body, strip)
     strip.level_light = body.albedo * (frame.lit_up if frame.eye_z > body.top else frame.lit_down)
@@ -253,7 +254,7 @@ def show_body(canvas: Canvas, body: Record, count: int) -> int:
             if varies:
                 _light_gap(frame, body, strip, mean_light)
             _paint_faces(canvas, body, top, first, last, bottom)
-            # Under the belly of an ellipsoid more than the ground can be seen.
+            # Under the belly of an ellipsoid more than the ground is visible.
             standing = body.bottom <= MIN_DEPTH and body.kind != ELLIPSOID
             count = _carve(canvas, count, k, top, bottom, standing)
     return count

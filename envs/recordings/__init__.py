@@ -1,8 +1,8 @@
 """Recordings of real and simulated event cameras: files in and out, and events from video.
 
-`read_events` takes a file of any known format, `write_events` makes one; `read_parts` and `event_writer`
-do so part by part. `video_to_events` turns a video into events, and `downscale_events` makes pixels
-larger. `Recording` is the simulator's own: events with the steps and settings behind them.
+`read_events` reads a file of any known format, `write_events` writes one; `read_parts` and `event_writer`
+do so part by part. `video_to_events` converts a video to events, and `downscale_events` reduces the
+resolution. `Recording` is the simulator's own format: events with the steps and settings that produced them.
 """
 
 from envs.recordings.beside import IMU, Frame, read_frames, read_imu

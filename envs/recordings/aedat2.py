@@ -1,4 +1,4 @@
-"""Read AEDAT 2.0, the files of jAER, from their description (inivation.github.io, "AEDAT file formats")."""
+"""Read AEDAT 2.0, jAER's files, as described in "AEDAT file formats" (inivation.github.io)."""
 
 from collections.abc import Iterator
 
@@ -16,18 +16,18 @@ CONTROL = bytes(set(range(32)) - {9, 10, 13}) + b"\x7f"  # bytes that no line of
 DVS128_SIZE = (128, 128)
 DAVIS_SIZES = {"DAVIS240": (240, 180), "DAVIS346": (346, 260), "DAVIS640": (640, 480), "DAVIS128": (128, 128)}
 DVS128_SPECIAL = 0x8000  # an external event
-DAVIS_SPECIAL = 0x80000400  # a frame's or inertial sample (bit 31), an external event (bit 10)
+DAVIS_SPECIAL = 0x80000400  # a sample of a frame or the inertial sensor (bit 31), an external event (bit 10)
 
 
 def read_aedat2(request: Request) -> Opened:
     """Open an AEDAT 2.0 file of a DVS128 or of a DAVIS.
 
-    The camera is the one that the header names (`AEChip`), else the one with the size that the caller
-    gives, else a DVS128 if all addresses fit into its 16 bits. jAER counts rows from below and shows
-    columns mirrored; x and y here go right and down. The 32-bit clock is unwrapped.
+    The header (`AEChip`) determines the camera, else the size that the caller gives, else it is a DVS128
+    if all addresses fit into 16 bits. jAER counts rows from below and mirrors columns; here x points
+    right and y down. The 32-bit clock is unwrapped.
 
     Raises:
-        ValueError: An unknown camera.
+        ValueError: The camera is unknown.
     """
     start, chip = _header(request)
     count = request.check_declared(whole_entries(request, start, ENTRY.itemsize))
@@ -37,7 +37,7 @@ def read_aedat2(request: Request) -> Opened:
 
 
 def _parts(request: Request, start: int, count: int, is_davis: bool) -> Iterator[Part]:
-    """Yield the events of entries of 8 bytes."""
+    """Yield the events of the 8-byte entries."""
     last_us, width, height = -1, request.width or 0, request.height or 0
     for body in mapped_parts(request, start, ENTRY, count):
         address, t_us = body["address"].astype(np.uint32), unwrap(body["t"].astype(np.uint32), 32, last_us)
@@ -57,9 +57,9 @@ def _parts(request: Request, start: int, count: int, is_davis: bool) -> Iterator
 
 
 def _header(request: Request) -> tuple[int, str]:
-    """Return the place of the first entry, and the name of the camera's chip or an empty text.
+    """Return the position of the first entry, and the name of the camera's chip or an empty string.
 
-    A line of the header is text. An entry whose first byte is that of `#` is none.
+    Header lines are text, so an entry whose first byte happens to be `#` is not taken for one.
     """
     with request.path.open("rb") as file:
         head = file.read(MAX_HEADER_BYTES)
@@ -82,7 +82,7 @@ def _header(request: Request) -> tuple[int, str]:
 
 
 def _camera(request: Request, chip: str, start: int, count: int) -> tuple[int, int, bool]:
-    """Return width, height and whether the addresses are those of a DAVIS."""
+    """Return width, height and whether the camera is a DAVIS."""
     for name, size in DAVIS_SIZES.items():
         if name in chip.upper():
             return *size, True

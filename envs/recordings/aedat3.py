@@ -1,6 +1,6 @@
-"""Read AEDAT 3.1 and 3.0, the files of cAER (DVS Gesture): packets of events after a header of text.
+"""Read AEDAT 3.1 and 3.0, cAER's files (DVS Gesture): packets of events after a text header.
 
-From the format's description (inivation.github.io, "AEDAT file formats") and libcaer's headers.
+Source: the format's description (inivation.github.io, "AEDAT file formats") and libcaer's headers.
 """
 
 import struct
@@ -15,11 +15,11 @@ from envs.recordings.event_file import CUT, CUT_PACKETS, TRIGGER, Opened, Reques
 MAGIC_3 = b"#!AER-DAT3"
 MAX_HEADER_BYTES = 1 << 20
 MAX_PACKET_BYTES = 1 << 28
-PACKET = struct.Struct("<hhiiiiii")  # type, source, size, place of t, turns of t, capacity, number, valid
+PACKET = struct.Struct("<hhiiiiii")  # type, source, size, offset of t, wraps of t, capacity, number, valid
 SPECIAL, POLARITY, FRAME, IMU6 = range(4)  # types of packets
 WORD = np.dtype([("data", "<u4"), ("t", "<i4")])
 EDGES = {2: (0, 1), 3: (0, -1), 4: (0, 0), 10: (1, 1), 11: (1, -1)}  # special type: channel, edge
-# Sensors by how the header names the source; the first that fits.
+# Sensor sizes by the beginning of the source's name in the header; the first match counts.
 SIZES = (
     ("DVS128", 128, 128), ("DAVIS128", 128, 128), ("DAVIS208", 208, 192), ("DAVIS240", 240, 180),
     ("DAVIS346", 346, 260), ("DAVIS640", 640, 480), ("DAVISHET640", 640, 480), ("DAVISRGB", 640, 480),
@@ -28,7 +28,7 @@ SIZES = (
 
 
 class Header(NamedTuple):
-    """What the header says.
+    """Contents of the header.
 
     Attributes:
         start: First byte of the packets.
@@ -42,7 +42,7 @@ class Header(NamedTuple):
 
 
 def read_aedat3(request: Request) -> Opened:
-    """Open the events of one source of an AEDAT 3 file; of several, `stream` names one, else the first.
+    """Open the events of one source of an AEDAT 3 file: the one that `stream` names, else the first.
 
     Raises:
         ValueError: The header has no end, the format is not RAW, or there is no such source.
@@ -62,10 +62,10 @@ def read_aedat3(request: Request) -> Opened:
 
 
 def read_header(request: Request) -> Header:
-    """Return what the lines of text say.
+    """Read the header's lines of text.
 
     Raises:
-        ValueError: They have no end, or name another format than RAW.
+        ValueError: The header has no end, or names a format other than RAW.
     """
     with request.path.open("rb") as file:
         head = file.read(MAX_HEADER_BYTES)
@@ -93,7 +93,7 @@ def read_header(request: Request) -> Header:
 
 
 def packets(request: Request, header: Header) -> Iterator[tuple[int, int, int, bytes]]:
-    """Yield type, source, turns of the clock [2**31 us] and body of each packet."""
+    """Yield type, source, wraps of the clock [2**31 us] and body of each packet."""
     with request.path.open("rb") as file:
         file.seek(header.start)
         while head := file.read(PACKET.size):
@@ -107,7 +107,7 @@ def packets(request: Request, header: Header) -> Iterator[tuple[int, int, int, b
                     f"{size} bytes; copy or record it again"
                 )
             body = file.read(size * number)
-            if len(body) < size * number:  # cut off: its whole events are read
+            if len(body) < size * number:  # cut off: read its complete events
                 request.tally.damage[CUT_PACKETS] += 1
                 body = body[: len(body) // size * size]
             yield kind, source, turns, body

@@ -1,9 +1,9 @@
 """Read and write AEDAT 4.0, the files of iniVation's DV: compressed flatbuffers in numbered streams.
 
-The walk through the packets checks every offset and the kind of each, so that a damaged file is refused. A
-file that was cut off is read up to there. Flatbuffers (google.github.io/flatbuffers, "Internals") are read
-without a library: a struct.error or ValueError means that a buffer is damaged. Written ones have one layout,
-by the schema of dv-processing (IOHeader, EventPacket, FileDataTable): each is a flatbuffer after its size.
+The reader checks every offset and the type of each packet, so that a damaged file raises an error. A
+truncated file is read up to its end. Flatbuffers (google.github.io/flatbuffers, "Internals") are read
+without a library: a struct.error or ValueError means that a buffer is damaged. The writer uses one layout, by
+the schema of dv-processing (IOHeader, EventPacket, FileDataTable): each is a flatbuffer preceded by its size.
 """
 
 import contextlib
@@ -25,14 +25,14 @@ MAX_HEADER_BYTES = 1 << 20
 MAX_PACKET_BYTES = 1 << 28
 CODECS = {1: "lz4", 2: "lz4", 3: "zstd", 4: "zstd"}
 PACKED_EVENT = np.dtype([("t", "<i8"), ("x", "<i2"), ("y", "<i2"), ("p", "u1"), ("pad", "V3")])
-# Channel (1 is the generator) and edge of a type.
+# Trigger type -> channel (1 is the generator) and edge.
 EDGES = {1: (0, 1), 2: (0, -1), 3: (0, 0), 4: (1, 1), 5: (1, -1)}
 BROKEN = (struct.error, ElementTree.ParseError, UnicodeDecodeError, OSError, ValueError)
 DAMAGED = "is damaged or no AEDAT 4.0 file ({}); copy or record it again"
 MAX_PIXELS = 1 << 15  # a coordinate is a signed 16-bit integer
 PACKET_EVENTS = 1 << 14
 LZ4 = 1
-TABLE_PLACE = len(MAGIC_4) + 32  # of the field that says where the table begins
+TABLE_PLACE = len(MAGIC_4) + 32  # position of the field that contains the start of the packet table
 DESCRIPTION = """<dv version="2.0">
     <node name="outInfo" path="/outInfo/">
         <node name="0" path="/outInfo/0/">
@@ -64,14 +64,14 @@ class Table(NamedTuple):
 
     Attributes:
         buffer: The bytes.
-        place: First byte of the table.
+        place: Position of its first byte.
     """
 
     buffer: bytes
     place: int
 
     def field(self, number: int) -> int | None:
-        """Return the place of a field, or None if it has its default."""
+        """Return the position of a field, or None if the field has its default."""
         (back,) = struct.unpack_from("<i", self.buffer, self.place)
         if not 0 <= self.place - back < len(self.buffer):
             raise ValueError("a table points outside its packet")
@@ -88,10 +88,12 @@ class Table(NamedTuple):
         return value
 
     def vector(self, number: int, size: int) -> tuple[int, int]:
-        """Return the place of the first element of a vector or text, and how many of `size` bytes there are.
+        """Return the position of the first element of a vector or text, and the number of elements.
+
+        `size` is the size of an element [bytes].
 
         Raises:
-            ValueError: The buffer has no room for them.
+            ValueError: The elements do not fit into the buffer.
         """
         place = self.field(number)
         if place is None:
@@ -121,9 +123,9 @@ class Stream(NamedTuple):
     """One stream of a file.
 
     Attributes:
-        number: Of its packets.
-        kind: Identifier, such as b"EVTS" of events.
-        width, height: Of the sensor, or None.
+        number: Number of the stream in its packets.
+        kind: Identifier, such as b"EVTS" for events.
+        width, height: Size of the sensor, or None.
     """
 
     number: int
@@ -133,13 +135,13 @@ class Stream(NamedTuple):
 
 
 class Layout(NamedTuple):
-    """What the header says.
+    """Contents of the header.
 
     Attributes:
-        codec: How packets are compressed, or None.
+        codec: Compression of the packets, or None.
         streams: All streams.
         start, end: First byte of the packets, and the byte after the last.
-        is_whole: Whether the file is as long as the header says.
+        is_whole: Whether the file is as long as the header declares.
     """
 
     codec: str | None
@@ -152,11 +154,12 @@ class Layout(NamedTuple):
 def read_aedat4(request: Request) -> Opened:
     """Open one stream of events of an AEDAT 4.0 file, uncompressed or packed with LZ4 or Zstandard.
 
-    Triggers come with the events. Of several streams of events the one is read that `stream` names, else
-    the first.
+    Triggers are read with the events. If there are several streams of events, `stream` chooses one, else
+    the first is read.
 
     Raises:
-        ValueError: A damaged header or packet, no stream of events, or a packet of more than 256 MiB.
+        ValueError: The header or a packet is damaged, a packet is larger than 256 MiB, or there is no
+            stream of events.
     """
     layout = read_layout(request)
     chosen = choose(request, layout.streams, EVENT_PACKET)
@@ -167,7 +170,7 @@ def read_aedat4(request: Request) -> Opened:
 
 
 def read_layout(request: Request) -> Layout:
-    """Return what the header of a file says.
+    """Read the header of a file.
 
     Raises:
         ValueError: The header is damaged.
@@ -192,7 +195,7 @@ def read_layout(request: Request) -> Layout:
 
 
 def choose(request: Request, streams: list[Stream], kind: bytes) -> Stream:
-    """Return the stream of a kind that the caller names, else the first; a note names the others.
+    """Return the stream of this kind that the caller names, else the first; add a note about the others.
 
     Raises:
         ValueError: There is no such stream.
@@ -218,11 +221,11 @@ def packets(request: Request, layout: Layout, kinds: dict[int, bytes]) -> Iterat
 
     Args:
         request: The file.
-        layout: Of its header.
+        layout: Contents of its header.
         kinds: Identifiers of the wanted streams, by number.
 
     Raises:
-        ValueError: A packet is damaged, and is not the last.
+        ValueError: A packet is damaged; a last packet that is only truncated is counted instead.
     """
     place = layout.start
     with request.refusing(BROKEN, DAMAGED), request.path.open("rb") as file:
@@ -259,7 +262,7 @@ def _packets(request: Request, layout: Layout, chosen: Stream) -> Iterator[np.nd
 
 
 def _unpacked(body: bytes, codec: str | None, kind: bytes) -> bytes:
-    """Return one flatbuffer of a kind; no more is unpacked than its first four bytes declare."""
+    """Return one flatbuffer of a kind; unpack no more bytes than its first four bytes declare."""
     if codec is None:
         whole = body[4:]
     else:
@@ -278,7 +281,7 @@ def _unpacked(body: bytes, codec: str | None, kind: bytes) -> bytes:
 
 
 def _events(request: Request, buffer: bytes) -> np.ndarray:
-    """Return the events of one flatbuffer `EventPacket`, copied, so that the rest of the packet is freed."""
+    """Return a copy of the events of one flatbuffer `EventPacket`, so that the packet can be freed."""
     with request.refusing(BROKEN, DAMAGED):
         start, count = root(buffer).vector(0, PACKED_EVENT.itemsize)
     events = np.frombuffer(buffer, PACKED_EVENT, count, start).copy()
@@ -305,7 +308,7 @@ def _streams(head: Table) -> Iterator[Stream]:
     text = head.buffer[start : start + count].decode()
     if "<!" in text:
         raise ValueError("its header declares XML entities, which are not read")
-    document = ElementTree.fromstring(text)  # noqa: S314  no entities are in it, nor more than a megabyte
+    document = ElementTree.fromstring(text)  # noqa: S314  it has no entities and at most a megabyte
     for node in document.iterfind(".//node[@name='outInfo']/node"):
         facts = {item.get("key"): item.text or "" for item in node.iterfind("attr")}
         sizes = {item.get("key"): item.text or "" for item in node.iterfind("node[@name='info']/attr")}
@@ -346,7 +349,7 @@ def aedat4_writer(path: Path, width: int, height: int) -> Iterator[Append]:
 
 
 def _packed(events: np.ndarray) -> np.ndarray:
-    """Return events as a packet has them."""
+    """Return events in the form of a packet."""
     packed = np.zeros(len(events), PACKED_EVENT)
     for name in ("t", "x", "y"):
         packed[name] = events[name]
@@ -355,15 +358,15 @@ def _packed(events: np.ndarray) -> np.ndarray:
 
 
 def _file_header(description: bytes) -> bytes:
-    """Return IOHeader: the codec, where the table begins (still -1), and the description of the streams."""
-    fields = struct.pack("<HHHHH2x", 10, 20, 4, 8, 16)  # sizes of this list and of the table, then places
+    """Return IOHeader: the codec, the start of the packet table (still -1), and the streams' description."""
+    fields = struct.pack("<HHHHH2x", 10, 20, 4, 8, 16)  # sizes of this list and of the table, then offsets
     table = struct.pack("<iiqI", 12, LZ4, -1, 4)
     text = struct.pack("<I", len(description)) + description + b"\0"
     return _sized(struct.pack("<I4s", 20, b"IOHE") + fields + table + text)
 
 
 def _vector(kind: bytes, count: int, elements: bytes) -> bytes:
-    """Return a flatbuffer whose root table has one field, a vector, that begins 32 bytes from its size."""
+    """Return a flatbuffer whose root table has one field, a vector; it starts 32 bytes after the size."""
     fields = struct.pack("<HHH2x", 6, 8, 4)
     return _sized(struct.pack("<I4s", 16, kind) + fields + struct.pack("<iII", 8, 4, count) + elements)
 
@@ -381,6 +384,6 @@ def _packet_table(rows: np.ndarray) -> bytes:
 
 
 def _sized(buffer: bytes) -> bytes:
-    """Return a flatbuffer after its size, filled up to whole 8 bytes."""
+    """Return a flatbuffer preceded by its size, padded to a multiple of 8 bytes."""
     buffer += bytes(-(4 + len(buffer)) % 8)
     return struct.pack("<I", len(buffer)) + buffer

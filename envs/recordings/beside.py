@@ -1,4 +1,4 @@
-"""Read what a file has beside its events: frames, and samples of an inertial sensor."""
+"""Read frames and samples of an inertial sensor from files of events."""
 
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -17,15 +17,15 @@ from envs.recordings.ros_storage import Topic, is_bag_folder, messages, open_bag
 IMU = np.dtype([("t", "<i8"), ("acceleration", "<f4", 3), ("rotation", "<f4", 3)])
 G = 9.80665  # m/s^2
 BROKEN_FRAME = (*aedat4.BROKEN, KeyError)
-CHANNELS = {0: 1, 16: 3, 24: 4}  # of OpenCV's types, as DV stores frames
+CHANNELS = {0: 1, 16: 3, 24: 4}  # OpenCV's type, in which DV stores frames -> channels
 ENCODINGS = {"mono8": ("u1", 1), "8UC1": ("u1", 1), "mono16": ("u2", 1), "rgb8": ("u1", 3), "bgr8": ("u1", 3)}
 IMAGE, INERTIAL = "sensor_msgs/Image", "sensor_msgs/Imu"
-# Images and their times [s] in HDF5 files, by the group of the camera: MVSEC.
+# Groups of the cameras in MVSEC's HDF5 files, with images and their times [s].
 HDF5_IMAGES = ("davis/left", "davis/right")
 
 
 class Frame(NamedTuple):
-    """A picture of the same sensor.
+    """A frame from the event sensor.
 
     Attributes:
         t_us: Middle of its exposure [us].
@@ -39,11 +39,11 @@ class Frame(NamedTuple):
 
 
 def read_frames(path: str | Path, **options: Any) -> Iterator[Frame]:
-    """Yield the frames of a file in turn.
+    """Yield the frames of a file in their order.
 
     Args:
-        path: A file of AEDAT 3 or 4, a ROS bag, or an HDF5 file in the layout of MVSEC.
-        options: `topic`, `group` or `stream`, as in `read_events`, of the frames.
+        path: An AEDAT 3 or 4 file, a ROS bag, or an HDF5 file in MVSEC's layout.
+        options: `topic`, `group` or `stream` of the frames, as in `read_events`.
 
     Raises:
         ValueError: The format has no frames, or the file is damaged.
@@ -52,14 +52,14 @@ def read_frames(path: str | Path, **options: Any) -> Iterator[Frame]:
 
 
 def read_imu(path: str | Path, **options: Any) -> np.ndarray:
-    """Return the samples of the inertial sensor, IMU array sorted by time.
+    """Return the samples of the inertial sensor, an IMU array sorted by time.
 
     Args:
-        path: A file of AEDAT 3 or 4, or a ROS bag.
+        path: An AEDAT 3 or 4 file, or a ROS bag.
         options: As in `read_frames`.
 
     Raises:
-        ValueError: The format has none, or the file is damaged.
+        ValueError: The format has no such samples, or the file is damaged.
     """
     rows = list(_reader(INERTIALS, "inertial samples", Path(path))(Request(Path(path), **options)))
     samples = np.array(rows, IMU)
@@ -67,11 +67,11 @@ def read_imu(path: str | Path, **options: Any) -> np.ndarray:
 
 
 class NoFramesError(ValueError):
-    """A file whose format may have frames has none."""
+    """The format of a file supports frames, but the file has none."""
 
 
 def has_frames(path: str | Path) -> bool:
-    """Whether the format of a file may have frames beside its events."""
+    """Whether the format of a file supports frames in addition to events."""
     path = Path(path)
     if is_bag_folder(path):
         return True
@@ -124,7 +124,7 @@ def _frames4(request: Request) -> Iterator[Frame]:
 
 
 def _imu4(request: Request) -> Iterator[tuple[Any, ...]]:
-    """Yield the inertial samples of an AEDAT 4 file, which are in g and degrees a second."""
+    """Yield the inertial samples of an AEDAT 4 file, which stores g and degrees per second."""
     for buffer in _packets4(request, b"IMUS"):
         with request.refusing(aedat4.BROKEN, "has damaged samples ({}); copy or record it again"):
             for row in aedat4.root(buffer).tables(0):
@@ -151,7 +151,7 @@ def _frames3(request: Request) -> Iterator[Frame]:
 
 
 def _imu3(request: Request) -> Iterator[tuple[Any, ...]]:
-    """Yield the inertial samples of an AEDAT 3 file, which are in g and degrees a second."""
+    """Yield the inertial samples of an AEDAT 3 file, which stores g and degrees per second."""
     row = np.dtype([("info", "<u4"), ("t", "<i4"), ("values", "<f4", 7)])
     for kind, _, turns, body in aedat3.packets(request, aedat3.read_header(request)):
         if kind == aedat3.IMU6 and len(body) % row.itemsize == 0:
@@ -162,7 +162,7 @@ def _imu3(request: Request) -> Iterator[tuple[Any, ...]]:
 
 
 def _messages(request: Request, kind: str) -> Iterator[Values]:
-    """Yield the messages of a type of a bag."""
+    """Yield the messages of one type in a bag."""
     for bag in open_bags(request):
         found = [topic for topic in bag.topics if topic.kind == kind]
         name = _one(request, found, bag.topics, kind) if found or request.topic else None
@@ -171,7 +171,7 @@ def _messages(request: Request, kind: str) -> Iterator[Values]:
 
 
 def _one(request: Request, found: list[Topic], topics: list[Topic], kind: str) -> str:
-    """Return the topic that is read: the one that the caller names, else the first."""
+    """Return the topic to read: the one that the caller names, else the first."""
     names = [topic.name for topic in found]
     if request.topic is not None and request.topic not in names:
         listing = ", ".join(f"{topic.name} ({topic.kind})" for topic in topics)
@@ -206,7 +206,7 @@ def _imu_ros(request: Request) -> Iterator[tuple[Any, ...]]:
 
 
 def _frames_hdf5(request: Request) -> Iterator[Frame]:
-    """Yield the images of an HDF5 file in the layout of MVSEC."""
+    """Yield the images of an HDF5 file in MVSEC's layout."""
     rule = "has no readable images ({}); give group, or another file"
     with request.refusing(ERRORS, rule), opened(request.path) as file:
         group = request.group or next((name for name in HDF5_IMAGES if f"{name}/image_raw" in file), "")

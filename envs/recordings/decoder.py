@@ -1,7 +1,7 @@
-"""Pictures of a video file or of image files, decoded by the ffmpeg program that imageio-ffmpeg brings.
+"""Decode pictures of a video file or of image files with the ffmpeg program that imageio-ffmpeg includes.
 
-It runs in a process of its own: a damaged file cannot take the interpreter with it, and only one picture is
-held at a time. Pictures of 8 bits are handed on with 8, deeper ones with 16, and floating point as it is.
+ffmpeg runs in its own process, so that a damaged file cannot crash the interpreter, and only one picture is
+in memory at a time. 8-bit pictures are returned with 8 bits, deeper ones with 16, floating point unchanged.
 """
 
 import queue
@@ -17,7 +17,7 @@ from typing import IO, NamedTuple
 import imageio_ffmpeg
 import numpy as np
 
-# Containers of one video; playlists are left out, because they can name other files.
+# Containers of one video. Playlists are excluded, because they can name other files.
 CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,ogg,flv,nut,gif"
 MAX_PIXELS = 1 << 26
 FRAME_TIMEOUT_S = 60.0
@@ -29,12 +29,12 @@ DAMAGE_LINE = re.compile(r"\[.*(error|corrupt|mismatch|invalid|ended prematurely
 
 
 class Layout(NamedTuple):
-    """How ffmpeg lays out a picture of one of its pixel formats.
+    """Memory layout of a picture in one of ffmpeg's pixel formats.
 
     Attributes:
-        dtype: Of a value.
-        channels: Their names, in order; "y" is grey and "a" opacity.
-        is_planar: Whether each channel is a plane of its own.
+        dtype: Type of a value.
+        channels: Names of the channels in their order; "y" is grey and "a" opacity.
+        is_planar: Whether each channel is stored as a separate plane.
     """
 
     dtype: np.dtype
@@ -42,8 +42,8 @@ class Layout(NamedTuple):
     is_planar: bool
 
 
-# What ffmpeg may hand on: it chooses the one that loses nothing. Floating point is never converted, since
-# that clips it to [0, 1].
+# Formats that ffmpeg may output; it chooses the one that loses nothing. Floating point is never converted,
+# since that would clip it to [0, 1].
 LAYOUTS = {
     "rgb24": Layout(np.dtype(np.uint8), "rgb", False),
     "rgba": Layout(np.dtype(np.uint8), "rgba", False),
@@ -63,7 +63,7 @@ class Picture(NamedTuple):
     """One decoded picture.
 
     Attributes:
-        t_us: Its time in the file, less the time at which the file begins [us].
+        t_us: Its time in the file, minus the start time of the file [us].
         values: (H, W, 3) of R, G and B, or (H, W) of grey; uint8, uint16 or float32.
     """
 
@@ -75,20 +75,20 @@ def decoded_video(path: Path) -> Iterator[Picture]:
     """Yield the pictures of a video file, in order.
 
     Raises:
-        ValueError: It is no video, is damaged, has a frame without time, or above 2**26 pixels.
+        ValueError: The file is no video, is damaged, or has a frame without time or above 2**26 pixels.
     """
     options = ["-format_whitelist", CONTAINERS, "-i", f"file:{path.resolve()}"]
     return _decoded(path, options, None)
 
 
 def decoded_images(paths: Sequence[Path]) -> Iterator[Picture]:
-    """Yield the pictures of image files, in order; their times are those of 25 pictures a second.
+    """Yield the pictures of image files, in order, with times as at 25 pictures per second.
 
-    They are read through numbered links, which ffmpeg takes for one stream.
+    ffmpeg reads them as one stream, through numbered links.
 
     Raises:
-        ValueError: One is no image of the kind that its suffix names, is damaged, or above 2**26 pixels, or
-            they are of several kinds or sizes.
+        ValueError: A file is no image of the type that its suffix names, is damaged, or above 2**26 pixels,
+            or the images differ in type or size.
     """
     kinds = sorted({path.suffix.lower() for path in paths})
     if len(kinds) != 1:
@@ -106,7 +106,7 @@ def decoded_images(paths: Sequence[Path]) -> Iterator[Picture]:
 
 
 def _decoded(path: Path, options: list[str], folder: str | None) -> Iterator[Picture]:
-    """Yield what ffmpeg decodes in a folder: pictures come by one pipe, a line for each by another."""
+    """Yield the pictures that ffmpeg decodes: one pipe carries the pictures, the other a line for each."""
     # fmt: off
     command = [
         imageio_ffmpeg.get_ffmpeg_exe(), "-nostdin", "-nostats", "-hide_banner", "-threads", "1", "-xerror",
@@ -128,12 +128,12 @@ def _decoded(path: Path, options: list[str], folder: str | None) -> Iterator[Pic
             if program.wait(FRAME_TIMEOUT_S) != 0:
                 raise ValueError(f"{path}: is damaged or truncated; copy or encode it again")
         finally:
-            program.kill()  # nothing more is wanted of it; it has ended unless the caller stops early
+            program.kill()  # it has already ended unless the caller stops early
             thread.join()
 
 
 def _read_lines(pipe: IO[bytes], lines: queue.SimpleQueue) -> None:
-    """Hand on what ffmpeg says, line by line, and None at its end."""
+    """Put the lines that ffmpeg prints into a queue, and None at the end."""
     is_begun = False
     while line := pipe.readline(1 << 16):
         if not is_begun:  # the rest of a long line could look like any other
@@ -143,7 +143,7 @@ def _read_lines(pipe: IO[bytes], lines: queue.SimpleQueue) -> None:
 
 
 def _paired(path: Path, pictures: IO[bytes], lines: queue.SimpleQueue) -> Iterator[Picture]:
-    """Put the two pipes together again."""
+    """Combine the pictures and the printed lines of ffmpeg's two pipes."""
     second: Fraction | None = None
     first: tuple[str, ...] | None = None
     said = ""
@@ -185,7 +185,7 @@ def _time_us(path: Path, ticks: str, second: Fraction | None) -> int:
 
 
 def _picture(path: Path, pictures: IO[bytes], name: str, width: str, height: str) -> np.ndarray:
-    """Return the next picture, as `Picture.values`."""
+    """Return the next picture in the form of `Picture.values`."""
     layout, shape = LAYOUTS[name], (int(height), int(width))
     size = shape[0] * shape[1] * len(layout.channels) * layout.dtype.itemsize
     raw = pictures.read(size)

@@ -1,4 +1,4 @@
-"""Make pixels larger: turn the events of a fine sensor into those of one with fewer pixels."""
+"""Convert the events of a sensor into the events of a sensor with fewer, larger pixels."""
 
 from typing import Literal
 
@@ -18,39 +18,39 @@ def downscale_events(
     """Return events as a sensor with larger pixels would have sent them.
 
     Pixel (x, y) belongs to the larger pixel (x * new_width // width, y * new_height // height);
-    where the sizes do not divide, blocks differ by one row or column.
+    if the sizes do not divide, blocks differ by one row or column.
 
     "integrate": a larger pixel sees the mean log luminance of its block, so each event of the
-    block moves it by threshold / pixels of the block. It fires when the sum of polarities since
-    its last event reaches the number of pixels of the block, either way, and keeps the rest.
-    A change that the whole block shares gives the events of one pixel; noise that cancels in
-    the block gives none. The sum starts at zero. Gruel et al. (VISAPP 2022) compare this family
-    of rules ("event count") with the next one.
+    block changes it by threshold / pixels of the block. It fires when the sum of polarities since
+    its last event reaches plus or minus the number of pixels of the block; the remainder carries
+    over. A change that the whole block shares gives the events of one pixel; noise that cancels
+    in the block gives none. The sum starts at zero. Gruel et al. (VISAPP 2022) compare this
+    family of rules ("event count") with the next one.
 
-    "funnel": every event stays, at the divided coordinates ("event funnelling" there). The
-    number of events stays and so the rate per pixel grows by the number of pixels in a block;
-    that is not what a sensor does, but what many readers do.
+    "funnel": every event remains, at the divided coordinates ("event funnelling" in that paper).
+    The number of events does not change, so the rate per pixel grows by the number of pixels in
+    a block. Real sensors do not behave like this, but many readers do.
 
     Args:
         events: EVENT array (N,), sorted by t, inside `from_shape`.
         from_shape: Rows and columns of the sensor [px].
-        to_shape: Rows and columns of the larger pixels; at most those of `from_shape`.
+        to_shape: Rows and columns of the larger pixels; at most `from_shape`.
         rule: "integrate" or "funnel".
 
     Returns:
-        EVENT array, sorted by t; for "integrate" at most one event per event, at its time. In
+        EVENT array, sorted by t; "integrate" gives at most one event per event, at its time. In
         each block of n pixels the sums of polarities obey -n < sum in - n * sum out < n.
 
     Raises:
-        ValueError: A shape that is larger than the old one or not positive, an unknown rule, or
-            events that are not valid for `from_shape`.
+        ValueError: `to_shape` is larger than `from_shape` or not positive, the rule is unknown, or
+            events are not valid for `from_shape`.
     """
     check_events(events, from_shape[1], from_shape[0])
     return Downscaler(from_shape, to_shape, rule)(events)
 
 
 class Downscaler:
-    """Makes pixels larger as `downscale_events` does, part by part: what is left in a block is carried on."""
+    """Apply `downscale_events` part by part; the sums of the blocks carry over to the next part."""
 
     def __init__(
         self,
@@ -58,7 +58,7 @@ class Downscaler:
         to_shape: tuple[int, int],
         rule: Literal["integrate", "funnel"] = "integrate",
     ) -> None:
-        """Begin with blocks at zero; raises as `downscale_events`."""
+        """Start with the sums of all blocks at zero; raises as in `downscale_events`."""
         if not all(0 < new <= old for old, new in zip(from_shape, to_shape, strict=True)):
             raise ValueError(f"to_shape must lie between (1, 1) and from_shape={from_shape}, got {to_shape}")
         if rule not in ("integrate", "funnel"):
@@ -90,7 +90,7 @@ def _integrate(
     sums: np.ndarray,
     moved: np.ndarray,
 ) -> int:
-    """Fill `moved` and return how many there are; `sizes` are pixels of blocks, `sums` their polarities."""
+    """Fill `moved`, return its number of events; `sizes` and `sums` are pixels and polarities per block."""
     count = 0
     for i in range(events.size):
         event = events[i]

@@ -1,7 +1,7 @@
 """Read the events of HDF5 files in Metavision's layout (`/CD/events`), with its ECF packing.
 
-Their library (github.com/prophesee-ai/hdf5_ecf, Apache 2.0) is the format's description. It trusts
-its input; here every length is checked, and the filter itself never runs.
+Source: Prophesee's library (github.com/prophesee-ai/hdf5_ecf, Apache 2.0). That filter trusts its
+input, so it never runs here; this decoder checks every length.
 """
 
 from collections.abc import Iterator
@@ -17,14 +17,14 @@ from envs.recordings.hdf5_checks import CUT_ERRORS, check_chunks, filters, is_cu
 EVENTS, TRIGGERS = "CD/events", "EXT_TRIGGER/events"
 FILTER_ECF = 0x8ECF
 MAX_CHUNK_EVENTS = 65535
-HEADER_BYTES = 12  # number of events and two marks of the packing, then the first time
+HEADER_BYTES = 12  # number of events and two flags of the packing, then the first time
 
 
 def metavision_parts(request: Request, file: h5py.File) -> Iterator[Part]:
     """Yield the events of an open file, chunk by chunk, with its triggers first.
 
     Raises:
-        ValueError: The data set is no rows of x, y, p and t, has other filters, or a chunk is damaged.
+        ValueError: The data set has no rows of x, y, p and t, has other filters, or a chunk is damaged.
     """
     data = _rows(file, EVENTS, "xypt")
     request.check_declared(len(data))
@@ -50,7 +50,7 @@ def metavision_parts(request: Request, file: h5py.File) -> Iterator[Part]:
 
 
 def _rows(file: h5py.File, name: str, fields: str | tuple[str, ...]) -> h5py.Dataset:
-    """Return a data set of rows with some fields of whole numbers."""
+    """Return a data set whose rows have these fields as integers; else raise ValueError."""
     data = plain(file, name, 1)
     names = data.dtype.names or ()
     if not all(field in names and data.dtype[field].kind in "iu" for field in fields):
@@ -66,7 +66,7 @@ def _assembled(request: Request, rows: np.ndarray) -> Part:
 
 
 def _triggers(request: Request, file: h5py.File) -> np.ndarray:
-    """Return the external triggers, if the file has them unpacked or packed with a known filter."""
+    """Return the external triggers; none if the file has none or packs them with an unknown filter."""
     try:
         data = _rows(file, TRIGGERS, ("t", "p", "id"))
         check_chunks(data, TRIGGERS)
@@ -81,7 +81,7 @@ def _triggers(request: Request, file: h5py.File) -> np.ndarray:
 
 
 def _chunks(request: Request, file: h5py.File, places: range) -> Iterator[np.ndarray]:
-    """Yield the events of some chunks, up to the first that is missing in a file that was cut off."""
+    """Yield the events of some chunks, up to the first missing one of a truncated file."""
     for place in places:
         try:
             yield _chunk(request, file[EVENTS], place)
@@ -93,7 +93,7 @@ def _chunks(request: Request, file: h5py.File, places: range) -> Iterator[np.nda
 
 
 def _chunk(request: Request, data: h5py.Dataset, first: int) -> np.ndarray:
-    """Return the events of one chunk; its filter, which trusts its input, is not run."""
+    """Return the events of one chunk, without running its HDF5 filter, which trusts its input."""
     stored = data.id.get_chunk_info_by_coord((first,)).size
     if stored > request.path.stat().st_size:
         raise ValueError(f"the chunk at event {first} declares {stored} bytes")
@@ -112,10 +112,10 @@ def decode_ecf(raw: np.ndarray, events: np.ndarray) -> bool:
 
     Args:
         raw: uint8, the stored chunk: times, then y, x and p, or y and (x, p), or (y, x, p) together.
-        events: EVENT array of as many events as the chunk should have.
+        events: EVENT array to fill, with as many events as the chunk should have.
 
     Returns:
-        Whether it has that many, and all of it is there.
+        Whether the chunk has that many events and is complete.
     """
     if raw.size < HEADER_BYTES:
         return False
@@ -133,7 +133,7 @@ def decode_ecf(raw: np.ndarray, events: np.ndarray) -> bool:
 
 @numba.njit(cache=True, error_model="numpy")
 def _number(raw: np.ndarray, place: int, size: int) -> int:
-    """Return a little-endian number of so many bytes."""
+    """Return a little-endian number of `size` bytes."""
     value = np.int64(0)
     for i in range(size):
         value |= np.int64(raw[place + i]) << 8 * i
@@ -142,7 +142,7 @@ def _number(raw: np.ndarray, place: int, size: int) -> int:
 
 @numba.njit(cache=True, error_model="numpy")
 def _length(raw: np.ndarray, place: int, count: int, longest: int) -> tuple[int, int]:
-    """Read how many events a word stands for, in two more bytes if they are many, and the next place."""
+    """Return the number of events of a word, which may take two more bytes, and the next position."""
     if count < longest:
         return count, place
     if place + 2 > raw.size:
@@ -152,7 +152,7 @@ def _length(raw: np.ndarray, place: int, count: int, longest: int) -> tuple[int,
 
 @numba.njit(cache=True, error_model="numpy")
 def _times(raw: np.ndarray, events: np.ndarray) -> int:
-    """Bytes of a step in time and how many events share it; where they end, or -1."""
+    """Decode bytes of a time step and its number of events; return the position after them, or -1."""
     t, n, place = _number(raw, 4, 8), 0, HEADER_BYTES
     step, shift = np.int64(0), 0
     while n < events.size:
@@ -179,7 +179,7 @@ def _times(raw: np.ndarray, events: np.ndarray) -> int:
 
 @numba.njit(cache=True, error_model="numpy")
 def _runs(raw: np.ndarray, place: int, size: int, events: np.ndarray) -> int:
-    """Words of y (two bytes) or p (one) and how many events share it; where they end, or -1."""
+    """Decode words of y (two bytes) or p (one) and its number of events; return the end position, or -1."""
     n, count_bits = 0, 5 if size == 2 else 7
     longest = (1 << count_bits) - 1
     while place >= 0 and n < events.size:
@@ -201,7 +201,7 @@ def _runs(raw: np.ndarray, place: int, size: int, events: np.ndarray) -> int:
 
 @numba.njit(cache=True, error_model="numpy")
 def _columns(raw: np.ndarray, place: int, events: np.ndarray) -> int:
-    """Words of x and which of the five pixels after it have an event too; where they end, or -1."""
+    """Decode words of x and a mask of the five pixels after it; return the position after them, or -1."""
     n = 0
     while place >= 0 and n < events.size:
         if place + 2 > raw.size:
@@ -217,7 +217,7 @@ def _columns(raw: np.ndarray, place: int, events: np.ndarray) -> int:
 
 @numba.njit(cache=True, error_model="numpy")
 def _packed(raw: np.ndarray, place: int, bits: int, events: np.ndarray) -> int:
-    """Three words for each four events, of 24 bits (y, x, p) or 12 (x, p); where they end, or -1."""
+    """Decode three words per four events of 24 bits (y, x, p) or 12 (x, p); return their end, or -1."""
     size = bits // 6
     shift = 8 * size - bits
     mask = (1 << bits) - 1

@@ -1,9 +1,9 @@
-"""Define what readers and writers of event files take and return, and check the columns that are read.
+"""Define the types that readers and writers of event files share, and check the columns that are read.
 
 A reader gets a `Request` and returns an `Opened` file: the sensor's size, and parts of events in the
-order of the file. `envs.recordings.order` puts the parts in the order of time, by one set of rules.
-What the file contains beside good events is counted in a `Tally`. An error is one ValueError that
-names the file, the rule and the remedy.
+order of the file. `envs.recordings.order` sorts the parts by time, by one set of rules for all formats.
+A `Tally` counts everything in the file other than good events. Every error is a ValueError that names
+the file, the rule and the remedy.
 """
 
 import contextlib
@@ -20,19 +20,19 @@ import numpy as np
 from envs.events import EVENT
 from envs.events.camera import T_LIMIT_US
 
-MAX_EVENTS = 100_000_000  # 1.3 GB in the end
-SMALL_EVENTS = 10_000_000  # any file may contain as many
-EVENTS_PER_BYTE = 2  # of dense recordings, five times as many as a camera's EVT 3.0 has
+MAX_EVENTS = 100_000_000  # 1.3 GB as an EVENT array
+SMALL_EVENTS = 10_000_000  # allowed for a file of any size
+EVENTS_PER_BYTE = 2  # of dense recordings, five times as many as in a camera's EVT 3.0
 MAX_BYTES = 1 << 38  # 275 GB; files are read in parts
-MAX_PACKED = 1000  # times a file's size that it may unpack to; events pack to a tenth
-SMALL_BYTES = 1 << 26  # any file may unpack to as many
+MAX_PACKED = 1000  # a file may unpack to this multiple of its size; events pack to a tenth
+SMALL_BYTES = 1 << 26  # allowed unpacked size for a file of any size
 PART_EVENTS = 1 << 22  # 55 MB
-CHUNK_EVENTS = 1 << 18  # as many are converted at once when they are written
+CHUNK_EVENTS = 1 << 18  # events that a writer converts at once
 
 TRIGGER = np.dtype([("t", "<i8"), ("channel", "<i2"), ("p", "i1")])  # us; +1 rising, -1 falling, 0 pulse
 NO_TRIGGERS = np.empty(0, TRIGGER)
 
-# Damage: why something is left out. Each is a count of `EventFile.damage`.
+# Kinds of damage: reasons to leave something out. Keys of `EventFile.damage`.
 OUTSIDE = "events outside the sensor"
 RESERVED = "words of types that the encoding does not have"
 CUT = "bytes of an entry that was cut off"
@@ -49,12 +49,12 @@ CUT_LINE = "lines that were cut off"
 
 @dataclasses.dataclass
 class Tally:
-    """Counts of what a reader found beside the events; it grows while parts are read.
+    """Counts of everything but good events that a reader found; they grow while parts are read.
 
     Attributes:
         skipped, late, strays, damage, gaps: As in `EventFile`.
-        codes: Codes of OFF that were seen, 0 or -1; one file has one.
-        notes: What the reader chose where the file left a choice, such as one of two streams.
+        codes: Codes of OFF seen so far, 0 or -1; a file may use only one.
+        notes: Choices that the reader made, such as one of two streams.
     """
 
     skipped: int = 0
@@ -71,7 +71,7 @@ class Part(NamedTuple):
 
     Attributes:
         events: EVENT array (N,).
-        is_noise: bool (N,), labels of the events; None: the file has none.
+        is_noise: bool (N,), labels of the events; None: the file has no labels.
         triggers: TRIGGER array (K,).
     """
 
@@ -86,7 +86,7 @@ class Part(NamedTuple):
 
 
 def concatenated(parts: Iterable[Part]) -> Part:
-    """Return parts as one, without a copy if there is only one."""
+    """Join parts into one, without a copy if there is only one."""
     some = list(parts)
     if len(some) == 1:
         return some[0]
@@ -104,21 +104,21 @@ class EventFile:
 
     Attributes:
         events: Shape (N,), dtype EVENT, sorted by t; ties keep the order of the file.
-        width, height: Pixels of the sensor; None where neither the file nor the caller says.
+        width, height: Pixels of the sensor; None if neither the file nor the caller states them.
         format: Name of the format that was read, such as "evt3".
-        late: Events that were older than one before them in the file, and were sorted in.
-        skipped: Entries that are no brightness change (triggers, frames, inertial samples, padding),
-            or come before the first time or row of an EVT stream.
-        dropped: Events that the simulated sensor lost to its limit (videos only).
-        strays: Times of an EVT stream that damage moved by more than a second, left out; the
-            events after one have the time before it, until the next.
-        is_noise: bool (N,), which events no change of the light fired; None: nobody knows.
-        missed: About which share of a scene's events its frames miss (videos and images only); None: too
-            few frames or events to tell.
+        late: Number of events that were older than an earlier one in the file, and were sorted in.
+        skipped: Number of entries that are no brightness change (triggers, frames, inertial samples,
+            padding), or come before the first time or row of an EVT stream.
+        dropped: Number of events that the simulated sensor lost to its limit (videos only).
+        strays: Number of times of an EVT stream that damage moved by more than a second. They are left
+            out: events after one get the previous time, until the next time.
+        is_noise: bool (N,), which events were not caused by a change of the light; None: not known.
+        missed: Approximate fraction of the scene's events that its frames miss (videos and images only);
+            None: too few frames or events to estimate it.
         triggers: TRIGGER array, external triggers: time [us], channel, edge.
-        damage: What was left out or moved because the file is damaged, and how often.
-        gaps: Pauses of more than a second: time of the last event before and of the first after [us].
-        notes: What the reader chose where the file left a choice.
+        damage: Kind of damage -> number of items that were left out or moved because of it.
+        gaps: Pauses of more than a second: times of the last event before and of the first after [us].
+        notes: Choices that the reader made.
     """
 
     events: np.ndarray
@@ -143,17 +143,17 @@ class Request:
 
     Attributes:
         path: A regular file, or the folder of a bag.
-        width, height: Pixels of the sensor [px], or None: as the file says.
+        width, height: Pixels of the sensor [px]; None: as stated in the file.
         columns: Names of columns, as in `read_events`.
-        time_unit: "s", "ms", "us" or "ns", where the file does not say.
+        time_unit: "s", "ms", "us" or "ns", if the file does not state it.
         topic: Topic of a bag.
         group: Group or data set of an HDF5 file, array of an npz file.
         stream: Number of a stream of events in an AEDAT file.
-        start_us, end_us: First time, and the time before which reading ends; None: all.
-        max_events: Most events that are read.
-        part_events: Most events of a part, about.
-        strict: Whether damage is refused.
-        tally: Counts of what is found; they grow while parts are read.
+        start_us, end_us: First time to read, and the time before which reading ends [us]; None: all.
+        max_events: Maximum number of events to read.
+        part_events: Approximate maximum number of events of a part.
+        strict: Whether damage is an error.
+        tally: Counts of damage and other findings; they grow while parts are read.
     """
 
     path: Path
@@ -177,11 +177,11 @@ class Request:
 
     @contextlib.contextmanager
     def refusing(self, errors: tuple[type[Exception], ...], rule: str) -> Iterator[None]:
-        """Turn errors of libraries into the refusal of the file; one that is a refusal already goes on.
+        """Convert errors of libraries to the error for the file; pass on an error that already names it.
 
         Args:
             errors: The types of the errors.
-            rule: The rule that the file breaks, with `{}` where the error says what is wrong.
+            rule: The rule that the file breaks, with `{}` for the text of the error.
 
         Raises:
             ValueError: There was such an error.
@@ -194,10 +194,10 @@ class Request:
             raise self.refusal(rule.format(error)) from None
 
     def check_count(self, count: int) -> int:
-        """Return the number of events, if it may be read.
+        """Return the number of events, if it is allowed.
 
         Raises:
-            ValueError: It is more than `max_events`.
+            ValueError: The number is above `max_events`.
         """
         if count > self.max_events:
             raise self.refusal(
@@ -207,10 +207,10 @@ class Request:
         return count
 
     def check_declared(self, count: int) -> int:
-        """Return the number of events that a file declares, if all of them may be read.
+        """Return the number of events that a file declares, if it is allowed.
 
         Raises:
-            ValueError: It is more than `max_events`, and the caller asked for no range of times.
+            ValueError: The number is above `max_events`, and the caller did not ask for a range of times.
         """
         return count if self.is_range else self.check_count(count)
 
@@ -223,7 +223,7 @@ class Request:
         """Return the same request with the sensor's size from the file filled in.
 
         Raises:
-            ValueError: The file and the caller name different sizes.
+            ValueError: The file and the caller state different sizes.
         """
         for name, said, given in (("width", width, self.width), ("height", height, self.height)):
             if said is not None and given is not None and said != given:
@@ -242,7 +242,7 @@ class Opened:
     Attributes:
         format: Name of the format.
         request: The request, with the sensor's size from the file filled in.
-        parts: The events in the order of the file, once.
+        parts: The events in the order of the file; can be iterated only once.
     """
 
     format: str
@@ -251,16 +251,16 @@ class Opened:
 
 
 Reader = Callable[[Request], Opened]
-# Adds events to a file that is written, and labels where the format has them.
+# Adds events to a file that is being written, and labels if the format supports them.
 Append = Callable[[np.ndarray, np.ndarray | None], None]
 
 
 def check_file(path: Path, max_bytes: int) -> int:
-    """Return the size of a regular file [bytes]; nothing is opened, so a FIFO cannot block.
+    """Return the size of a regular file [bytes] without opening it, so that a FIFO cannot block.
 
     Raises:
-        ValueError: There is no such file, it is a directory, device or pipe, it is empty,
-            or it is larger than `max_bytes`.
+        ValueError: The file does not exist, is a directory, device or pipe, is empty, or is larger
+            than `max_bytes`.
     """
     try:
         info = path.stat()
@@ -278,15 +278,15 @@ def check_file(path: Path, max_bytes: int) -> int:
 
 
 def usual_events(size: int) -> int:
-    """Return the most events that a file of a size [bytes] may contain unless the caller allows more."""
+    """Return the default limit of events for a file of `size` bytes."""
     return min(MAX_EVENTS, max(SMALL_EVENTS, EVENTS_PER_BYTE * size))
 
 
 def check_declared(path: Path, name: str, declared_bytes: int) -> None:
-    """Refuse contents that are far too large for the file, before memory is taken.
+    """Raise an error for contents that are far too large for the file, before memory is allocated.
 
     Raises:
-        ValueError: `declared_bytes` are more than `MAX_PACKED` times the file's size.
+        ValueError: `declared_bytes` is above `MAX_PACKED` times the file's size, and above `SMALL_BYTES`.
     """
     size = path.stat().st_size
     if declared_bytes > max(SMALL_BYTES, MAX_PACKED * size):
@@ -296,7 +296,7 @@ def check_declared(path: Path, name: str, declared_bytes: int) -> None:
 
 
 def whole_entries(request: Request, start: int, entry: int) -> int:
-    """Return how many entries of `entry` bytes a file has from `start` on; count the bytes after the last."""
+    """Return the number of entries of `entry` bytes from `start` on; count rest bytes in the tally."""
     size = request.path.stat().st_size - start
     if size % entry:
         request.tally.damage[CUT] += size % entry
@@ -304,16 +304,16 @@ def whole_entries(request: Request, start: int, entry: int) -> int:
 
 
 def polarity(request: Request, values: np.ndarray) -> np.ndarray:
-    """Return polarities in {-1, +1}, int8, from either of the two codes in use, of which a file has one.
+    """Return polarities in {-1, +1}, int8, from either of the two codes in use; a file may use only one.
 
     Args:
-        request: The file, whose tally tells the codes of OFF that were seen before.
+        request: The file, whose tally contains the codes of OFF seen so far.
         values: Numbers or booleans.
 
     Raises:
         ValueError: The values are neither all in {0, 1} nor all in {-1, +1}.
     """
-    if values.dtype.kind == "u" and values.dtype.itemsize >= 4:  # -1 as some writers store it
+    if values.dtype.kind == "u" and values.dtype.itemsize >= 4:  # some writers store -1 like this
         values = np.where(values == np.iinfo(values.dtype).max, np.int64(-1), values.astype(np.int64))
     good = (values == 1) | (values == 0) | (values == -1)
     if not good.all():
@@ -337,27 +337,27 @@ def assemble(
 ) -> Part:
     """Return a part from columns of numbers of any type; t is already in microseconds.
 
-    A row that is no event (a time that is not finite or outside [0, 2**52), a coordinate outside
-    [0, 65536)) is left out and counted, unless more than a tenth of the rows are none.
+    An invalid row (a time that is not finite or outside [0, 2**52), a coordinate outside [0, 65536))
+    is left out and counted.
 
     Args:
         request: The file.
         t_us: Times (N,) [us].
         x: Columns of the sensor [px].
-        y: Its rows [px].
+        y: Rows of the sensor [px].
         p: Polarities, in either code.
-        is_noise: Labels, 0 or 1; None: there are none.
+        is_noise: Labels, 0 or 1; None: no labels.
         triggers: TRIGGER array of the part.
 
     Raises:
-        ValueError: Too many rows are no event, a coordinate is fractional, a polarity is not coded in one
-            of the two ways, or a label is neither 0 nor 1.
+        ValueError: More than a tenth of the values of t, x or y are invalid, a coordinate is fractional, a
+            polarity is not coded in one of the two ways, or a label is neither 0 nor 1.
     """
     columns, good = {"t": t_us, "x": x, "y": y}, np.ones(len(t_us), bool)
     for name, limit in (("t", T_LIMIT_US), ("x", 65536), ("y", 65536)):
         values = columns[name]
         if values.dtype.kind == "f":
-            values = values.astype(np.float64)  # half floats end at 65504
+            values = values.astype(np.float64)  # float16 ends at 65504
         fits = (values >= 0) & (values < limit)  # NaN and infinity do not
         bad = len(values) - np.count_nonzero(fits)
         if bad > max(1, len(values) // 10) or bad == len(values):
@@ -379,15 +379,15 @@ def assemble(
 
 
 def gathered(request: Request, dtype: np.dtype, packets: Iterable[np.ndarray]) -> Iterator[Part]:
-    """Yield what packets contain as parts of about `part_events` events.
+    """Yield the contents of packets as parts of about `part_events` events.
 
     Args:
         request: The file.
-        dtype: Of the events, with the fields t [us], x, y and p.
+        dtype: Type of the events, with the fields t [us], x, y and p.
         packets: Arrays (N,) of this dtype, and TRIGGER arrays.
 
     Raises:
-        ValueError: As `assemble`.
+        ValueError: As in `assemble`.
     """
     some, triggers, count = [np.empty(0, dtype)], [NO_TRIGGERS], 0
     for packet in itertools.chain(packets, (None,)):  # None: the end
@@ -411,7 +411,7 @@ def _labels(request: Request, is_noise: np.ndarray) -> np.ndarray:
 
 
 def _refuse_column(request: Request, name: str, values: np.ndarray, fits: np.ndarray, limit: int) -> None:
-    """Raise the error for a column with too many values that are none, if there are any."""
+    """Raise the error for a column with too many invalid values; return if it has none."""
     if fits.all():
         return
     first = int(np.argmin(fits))
@@ -451,7 +451,7 @@ def check_events(events: np.ndarray, width: int, height: int) -> None:
 
 
 def check_order(events: np.ndarray) -> None:
-    """Refuse events that are not sorted by time.
+    """Check that events are sorted by time.
 
     Raises:
         ValueError: An event is older than the one before it.
@@ -463,6 +463,6 @@ def check_order(events: np.ndarray) -> None:
 
 
 def chunks(events: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield events in parts that are converted at once."""
+    """Yield events in chunks of at most `CHUNK_EVENTS`."""
     for first in range(0, len(events), CHUNK_EVENTS):
         yield events[first : first + CHUNK_EVENTS]

@@ -1,7 +1,7 @@
-"""Decode the packets of event_camera_msgs, by the descriptions in event_camera_codecs (Apache 2.0).
+"""Decode the packets of event_camera_msgs, as described in event_camera_codecs (Apache 2.0).
 
-The encodings of Prophesee's cameras are streams of words: what a packet does not say the one before it did.
-libcaer's and mono are rows of 8 bytes; libcaer_cmp is words of 16 bits, and starts again with each packet.
+The encodings of Prophesee's cameras are streams of words, so a packet depends on the packets before it.
+libcaer and mono are rows of 8 bytes. libcaer_cmp is words of 16 bits, and each packet is independent.
 """
 
 from typing import NamedTuple
@@ -35,8 +35,8 @@ class EventPacket(NamedTuple):
 
     Attributes:
         width, height: Pixels of the sensor.
-        time_base_ns: Added to the times of the packet, by some encodings.
-        encoding: Such as "evt3".
+        time_base_ns: Offset that some encodings add to the times of the packet.
+        encoding: Name of the encoding, such as "evt3".
         body: The bytes of the camera.
     """
 
@@ -48,7 +48,7 @@ class EventPacket(NamedTuple):
 
 
 class PacketDecoder:
-    """Collects the messages of a topic, and decodes packets together."""
+    """Collect the messages of a topic, and decode several packets together."""
 
     def __init__(self, request: Request) -> None:
         self._request = request
@@ -57,7 +57,7 @@ class PacketDecoder:
         self._states: dict[str, np.ndarray] = {}
 
     def add(self, packet: EventArray | EventPacket) -> None:
-        """Take a packet.
+        """Add a packet.
 
         Raises:
             ValueError: Its encoding is not known.
@@ -90,7 +90,7 @@ class PacketDecoder:
 
 
 def _libcaer(packet: EventPacket, tally: Tally) -> np.ndarray:
-    """Return the columns of libcaer's polarity events, whose clock of 31 bits may turn within a packet."""
+    """Return the columns of libcaer's polarity events, whose 31-bit clock may wrap within a packet."""
     words = _whole(packet.body, ROW, tally)
     low = words["t"].astype(np.int64)
     turns = np.concatenate(([0], np.cumsum(np.diff(low) < 0))) if len(low) else low
@@ -118,7 +118,7 @@ def _libcaer_cmp(packet: EventPacket, tally: Tally) -> np.ndarray:
 
 
 def _whole(body: bytes, dtype: np.dtype, tally: Tally) -> np.ndarray:
-    """Return the whole entries of a packet; count the bytes after them."""
+    """Return the complete entries of a packet; count the remaining bytes as damage."""
     rest = len(body) % dtype.itemsize
     if rest:
         tally.damage[CUT] += rest
@@ -137,7 +137,7 @@ def decode_libcaer_cmp(  # noqa: C901  a branch for each type of word
         columns: int64 (4, 8 N), filled with t [us], x, y and p.
 
     Returns:
-        Number of events, number of words of no type.
+        Number of events, number of words of an unknown type.
     """
     n, reserved = 0, 0
     high = low = x = y = p = np.int64(0)

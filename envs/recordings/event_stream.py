@@ -1,7 +1,7 @@
-"""Read Event Stream files (.es), version 2: one byte for the time since the last event, then its pixel.
+"""Read Event Stream files (.es), version 2: one byte for the time since the last event, then the pixel.
 
-From the format's description (github.com/neuromorphic-paris/event_stream) and the library of its
-authors, sepia (MIT licence), which counts rows from below.
+Source: the format's description (github.com/neuromorphic-paris/event_stream) and its authors' library
+sepia (MIT licence), which counts rows from below.
 """
 
 from collections.abc import Iterator
@@ -17,14 +17,14 @@ MAGIC_ES = b"Event Stream"
 HEADER_BYTES = len(MAGIC_ES) + 8  # version 3, type 1, width 2, height 2
 DVS, ATIS = 1, 2
 EVENT_BYTES = 5
-PLACE, TIME, EXPOSURES = range(3)  # of a decoder's state
+PLACE, TIME, EXPOSURES = range(3)  # indices of a decoder's state
 
 
 def read_es(request: Request) -> Opened:
-    """Open a file of type DVS or ATIS; exposures of an ATIS are passed over and counted.
+    """Open a file of type DVS or ATIS; exposures of an ATIS are skipped and counted.
 
     Raises:
-        ValueError: Another version or type.
+        ValueError: The file has another version or type.
     """
     with request.path.open("rb") as file:
         head = file.read(HEADER_BYTES)
@@ -62,23 +62,23 @@ def _parts(request: Request, is_atis: bool) -> Iterator[Part]:
 
 @numba.njit(cache=True, error_model="numpy")
 def decode_es(raw: np.ndarray, is_atis: bool, height: int, state: np.ndarray, events: np.ndarray) -> int:
-    """Decode until the events are full or the bytes end.
+    """Decode until `events` is full or the bytes end.
 
-    The first byte of an event is its time since the last one [us] and, below it, one bit (ATIS:
-    two) of what happened; times too long for it are sent before in bytes of their own.
+    The first byte of an event is its time since the last one [us] and, in the lowest bit (ATIS:
+    two bits), its kind. Separate bytes before it carry longer times.
 
     Args:
         raw: uint8, the file after its header.
         is_atis: Whether the events are of type ATIS.
         height: Rows of the sensor [px]; a row outside it gets y = 65535.
-        state: int64 (3,): next byte, time, exposures passed over; it is moved on.
+        state: int64 (3,): next byte, time, skipped exposures; updated in place.
         events: EVENT array to fill.
 
     Returns:
         Number of events.
     """
     bits = 2 if is_atis else 1
-    least = 0xFC if is_atis else 0xFE  # bytes from here on only count time
+    least = 0xFC if is_atis else 0xFE  # bytes from this value on only advance the time
     longest = np.int64(0xFF >> bits)
     n, i, t = 0, state[PLACE], state[TIME]
     while i < raw.size and n < events.size:

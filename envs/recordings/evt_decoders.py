@@ -1,11 +1,11 @@
 """Decode the words of Prophesee's DAT and of its encodings EVT 2.0, EVT 2.1 and EVT 3.0, in kernels.
 
-A decoder of EVT is called once for each part: it goes on where its state says, and fills arrays of events
-and triggers until one of them is full or the words end.
+An EVT decoder is called once for each part: it continues from its state, and fills arrays of events and
+triggers until one of them is full or the words end.
 
-A high part of the time is stray if it lies more than a second from the time before it and one of the next
-few is near that time again: a flipped bit, not a gap. It is passed over; taken for the time, it would move
-every later event by a turn of the clock.
+A high part of the time is stray if it lies more than a second from the previous time and one of the next few
+is near the previous time again: a flipped bit, not a gap. It is skipped; otherwise it would move every later
+event by a wrap of the clock.
 """
 
 from enum import IntEnum
@@ -14,9 +14,9 @@ import numba
 import numpy as np
 
 FIRST_VENDOR_TYPE = 14  # words of this type and above are the vendor's own, in all encodings
-COLUMNS = 1 << 11  # an address of 11 bits tells them apart
-FAR_US = 1_000_000  # as far as events may be out of order
-LOOK_AHEAD = 16  # high parts
+COLUMNS = 1 << 11  # columns that an 11-bit address can represent
+FAR_US = 1_000_000  # limit of disorder among events
+LOOK_AHEAD = 16  # number of high parts
 
 
 class Evt2(IntEnum):
@@ -43,7 +43,7 @@ class Evt3(IntEnum):
 
 
 class State(IntEnum):
-    """Places of a decoder's state, int64: where it is, what it knows, and what it counted."""
+    """Indices of a decoder's state, int64: its position, the current values, and its counts."""
 
     WORD = 0  # index of the next word
     BASE = 1  # high part of the time [us]; -1: not known yet
@@ -57,13 +57,13 @@ class State(IntEnum):
     BEYOND = 9  # events beyond the last column
 
 
-PADDING = 9  # type of the words with which a camera fills its packets (data sheet of the IMX636)
+PADDING = 9  # type of the words with which a camera pads its packets (data sheet of the IMX636)
 # One bit for each type that EVT 3.0 does not have.
 RESERVED_EVT3 = sum(1 << kind for kind in range(FIRST_VENDOR_TYPE) if kind not in {*Evt3, PADDING})
 
 
 def new_state() -> np.ndarray:
-    """Return the state of a decoder that has seen nothing."""
+    """Return the initial state of a decoder."""
     state = np.zeros(len(State), np.int64)
     state[State.BASE] = state[State.Y] = -1
     return state
@@ -90,7 +90,7 @@ def _emit(events: np.ndarray, n: int, mask: int, t: int, x: int, y: int, p: int)
 
 @numba.njit(cache=True, error_model="numpy")
 def _inside(mask: int, x: int) -> int:
-    """Return the bits of a mask whose columns exist."""
+    """Return the bits of a mask that lie within the last column."""
     if x > COLUMNS - 32:
         mask &= (1 << max(COLUMNS - x, 0)) - 1
     return mask
@@ -106,7 +106,7 @@ def _trigger(triggers: np.ndarray, k: int, t: int, channel: int, is_rising: int)
 
 @numba.njit(cache=True, error_model="numpy")
 def _time_base(value: int, base: int, low_bits: int, high_bits: int) -> int:
-    """Return the time of a new high part [us]; a fall by more than half its range is a turn of the clock."""
+    """Return the time of a new high part [us]; a fall by more than half its range is a wrap of the clock."""
     bits = low_bits + high_bits
     if base < 0:
         return value << low_bits
@@ -117,13 +117,13 @@ def _time_base(value: int, base: int, low_bits: int, high_bits: int) -> int:
 
 @numba.njit(cache=True, error_model="numpy")
 def _is_far(value: int, base: int, low_bits: int, high_bits: int) -> bool:
-    """Whether a high part lies more than a second from the time before it."""
+    """Whether a high part lies more than a second from the previous time."""
     return abs(_time_base(value, base, low_bits, high_bits) - base) > FAR_US
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _is_stray(words: np.ndarray, place: int, base: int, low_bits: int, high_bits: int) -> bool:
-    """Whether a high part far from the time before it is stray; the first one if the next two are earlier."""
+    """Whether a high part far from the previous time is stray; the first one, if the next two are earlier."""
     value, seen = np.int64(words[place]) & (1 << high_bits) - 1, 0
     for i in range(place + 1, words.size):
         word = np.int64(words[i])
@@ -161,7 +161,7 @@ def decode_evt2(
     Args:
         words: uint32 (N,): type 4 bits, low time 6 bits, x 11 bits, y 11 bits.
         masks: uint32 (N,): which of the 32 pixels from x on have an event; empty for EVT 2.0.
-        state: Of `new_state`; it is moved on.
+        state: From `new_state`; updated in place.
         events: EVENT array of at least 32 events to fill.
         triggers: TRIGGER array to fill.
 
@@ -201,11 +201,11 @@ def decode_evt3(  # noqa: C901  a branch for each type of word
 ) -> tuple[int, int]:
     """Decode EVT 3.0.
 
-    The low part of the time counts as zero from a changed high part until the next low part.
+    After a changed high part the low part of the time is zero until the next low part.
 
     Args:
         words: uint16 (N,): type 4 bits, value 12 bits.
-        state: Of `new_state`; it is moved on.
+        state: From `new_state`; updated in place.
         events: EVENT array of at least 12 events to fill.
         triggers: TRIGGER array to fill.
 
@@ -255,7 +255,7 @@ def decode_evt3(  # noqa: C901  a branch for each type of word
 
 @numba.njit(cache=True, error_model="numpy")
 def _mask(kind: int, value: int) -> int:
-    """Return which of the pixels from x on have an event by an EVT 3.0 word."""
+    """Return the mask of the pixels from x on for which an EVT 3.0 word has an event."""
     if kind == Evt3.VECTOR_12:
         return value
     return value & 255 if kind == Evt3.VECTOR_8 else int(kind == Evt3.EVENT)
@@ -263,11 +263,11 @@ def _mask(kind: int, value: int) -> int:
 
 @numba.njit(cache=True, error_model="numpy")
 def decode_dat(words: np.ndarray, last_us: int, events: np.ndarray) -> None:
-    """Decode DAT, whose clock of 32 bits is unwrapped as by `clocks.unwrap`.
+    """Decode DAT; unwrap its 32-bit clock as in `clocks.unwrap`.
 
     Args:
         words: Shape (N,), fields t and data, uint32: x 14 bits, y 14 bits, polarity 1 bit.
-        last_us: The time before the first [us]; -1: none.
+        last_us: The previous time [us]; -1: none.
         events: EVENT array (N,) to fill.
     """
     t, full, half = np.int64(last_us), np.int64(1) << 32, np.int64(1) << 31

@@ -1,4 +1,4 @@
-"""List the formats of event files: a row says how one is recognised, and who reads and writes it."""
+"""List the formats of event files, with how to recognise, read and write each."""
 
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
@@ -27,12 +27,13 @@ class Format(NamedTuple):
     """One format.
 
     Attributes:
-        read: Opens a file; None: it is only written.
-        write: Makes a file from path, width and height, and whether there are labels if `has_labels`.
-        beginnings: How its files begin. None of it and no suffix: the caller names the format.
-        suffixes: Of files that may begin in another way.
-        written_suffixes: That `write_events` takes for it.
-        options: Arguments of `read_events` that only some formats have.
+        read: Function that opens a file; None: the format can only be written.
+        write: Function that creates a file from path, width and height, and, if `has_labels`, whether there
+            are labels; None: the format can only be read.
+        beginnings: First bytes of its files. Without these and `suffixes`, the caller must name the format.
+        suffixes: Suffixes of files without such first bytes.
+        written_suffixes: Suffixes for which `write_events` chooses this format.
+        options: Arguments of `read_events` that it supports, of those that only some formats have.
         has_labels: Whether it stores labels of noise.
     """
 
@@ -56,7 +57,7 @@ TABLE: Mapping[str, Format] = {
     "csv": Format(write=partial(text_writer, separator=","), written_suffixes=(".csv",)),
     "dat": Format(read_dat, dat_writer, (b"% Data file containing",), written_suffixes=(".dat",)),
     "es": Format(read_es, beginnings=(MAGIC_ES,)),
-    "evt": Format(read_evt, beginnings=(b"% ",), suffixes=EVT_SUFFIXES),  # or DAT, as its header says
+    "evt": Format(read_evt, beginnings=(b"% ",), suffixes=EVT_SUFFIXES),  # or DAT, depending on its header
     "evt2": Format(partial(read_evt, format="evt2"), evt2_writer),
     "evt21": Format(partial(read_evt, format="evt21")),
     "evt3": Format(partial(read_evt, format="evt3"), evt3_writer, written_suffixes=EVT_SUFFIXES),
@@ -96,7 +97,7 @@ BEGINNING_BYTES = 32
 
 
 def recognised(path: Path) -> str:
-    """Return the format of a file by how it begins, else by its suffix.
+    """Return the format of a file by its first bytes, else by its suffix.
 
     Raises:
         ValueError: Neither is known.
@@ -115,10 +116,10 @@ def recognised(path: Path) -> str:
 
 
 def check_options(path: Path, format: str, given: Mapping[str, Any]) -> None:
-    """Refuse options that have no effect on a format.
+    """Raise an error for options that have no effect on a format.
 
     Raises:
-        ValueError: An option that is not None is none of the format's.
+        ValueError: An option that the format does not have is not None.
     """
     for name in OPTIONS:
         if given.get(name) is not None and name not in TABLE[format].options:

@@ -1,4 +1,4 @@
-"""How many events a sequence of frames misses because nothing is seen between two of them."""
+"""Estimate the fraction of events that a sequence of frames misses between the frames."""
 
 import math
 
@@ -7,23 +7,23 @@ import numpy as np
 from envs.config import CameraConfig
 from envs.events import EventCamera
 
-MOST_PIXELS = 1 << 14  # that are looked at; they lie on an even grid
+MOST_PIXELS = 1 << 14  # pixels to sample, on a regular grid
 FEWEST_INTERVALS = 4
 FEWEST_EVENTS = 100
-REPEATED = 0.02  # of the largest change from frame to frame, up to which a frame repeats another
+REPEATED = 0.02  # a frame that changes by at most this fraction of the largest change repeats the last one
 
 
 class FrameLoss:
-    """Compares the events of all frames with those of every other frame.
+    """Compare the events of all frames with the events of every other frame.
 
-    Halving the frame rate loses a share s of the events. If what is lost is in proportion to the time between
-    frames, the frames as they are miss the share s / (1 + s) of all events. That is about the truth for edges
-    that move, and more than the truth for light that changes smoothly. Noise of the frames counts as motion.
-    A frame that repeats the one before it shows nothing new, so it is left out.
+    Halving the frame rate loses a fraction s of the events. If the loss is proportional to the time between
+    frames, the frames miss the fraction s / (1 + s) of all events. This is about right for moving edges, and
+    too high for light that changes smoothly. Noise of the frames counts as motion. A frame that repeats the
+    one before it shows nothing new and is left out.
     """
 
     def __init__(self, camera: CameraConfig) -> None:
-        """Make two ideal cameras with the thresholds, the response and the floor of `camera`."""
+        """Create two ideal cameras with the thresholds, response and luminance floor of `camera`."""
         self._stride = math.ceil(math.sqrt(camera.width * camera.height / MOST_PIXELS))
         ideal = CameraConfig(
             width=len(range(0, camera.width, self._stride)),
@@ -41,7 +41,7 @@ class FrameLoss:
         self._largest_change = 0.0
 
     def see(self, luminance: np.ndarray, t_us: int) -> None:
-        """Take the next frame, float32 (H, W), linear."""
+        """Add the next frame, float32 (H, W), linear."""
         sample = np.ascontiguousarray(luminance[:: self._stride, :: self._stride])
         if self._repeats(sample):
             return
@@ -50,13 +50,13 @@ class FrameLoss:
             self._other.reset(sample, t_us)
         else:
             self._since += self._every.step(sample, t_us).size
-            if self._frames % 2 == 0:  # both have come to the same time
+            if self._frames % 2 == 0:  # both cameras are at the same time
                 self._of_every, self._since = self._of_every + self._since, 0
                 self._of_other += self._other.step(sample, t_us).size
         self._frames += 1
 
     def _repeats(self, sample: np.ndarray) -> bool:
-        """Whether a frame is the last one again, as coded; if not, remember it."""
+        """Whether a frame repeats the last one, apart from coding noise; if not, store it."""
         if self._last is not None:
             change = float(np.abs(sample - self._last).mean(dtype=np.float64))
             if change <= REPEATED * self._largest_change:
@@ -67,13 +67,13 @@ class FrameLoss:
 
     @property
     def at_half_rate(self) -> float | None:
-        """Share of the events that every other frame loses; None: too few frames or events to tell."""
+        """Fraction of events lost with every other frame; None: too few frames or events to estimate it."""
         if self._frames <= FEWEST_INTERVALS or self._of_every < FEWEST_EVENTS:
             return None
         return max(0.0, 1.0 - self._of_other / self._of_every)
 
     @property
     def share(self) -> float | None:
-        """About which share of the scene's events the frames miss; None: too few frames or events to tell."""
+        """Estimated fraction of the scene's events that the frames miss; None: too few frames or events."""
         lost = self.at_half_rate
         return None if lost is None else lost / (1.0 + lost)

@@ -1,7 +1,7 @@
 """Read and write the recordings of this project: HDF5 files of events with their steps and settings.
 
-The layout is that of DSEC (github.com/uzh-rpg/DSEC): `events/{t,x,y,p}`, an offset and an index of
-milliseconds; `index` and the attribute `about` are added.
+The layout is DSEC's (github.com/uzh-rpg/DSEC), `events/{t,x,y,p}`, an offset and an index of
+milliseconds, plus `index` and the attribute `about`.
 """
 
 import bisect
@@ -22,18 +22,18 @@ from envs.recordings.hdf5_checks import ERRORS, attribute, check_own, declared_l
 MAX_EVENTS = 2_000_000_000
 MAX_INDEX = 200_000_000
 MAX_BYTES = 8 << 30
-# How data sets are compressed, and given a checksum, so that a flipped bit is noticed.
+# Compression of the data sets, with a checksum that detects a flipped bit.
 PACKING = {**hdf5plugin.Blosc2(cname="zstd", clevel=3), "fletcher32": True}
 
 
 @dataclasses.dataclass(frozen=True)
 class Recording:
-    """Events in time order, with where things begin and how they were made.
+    """Events in time order, with an index of steps and the settings that produced them.
 
     Attributes:
         events: Shape (N,), dtype EVENT, sorted by t.
         index: Named integer arrays, such as `step_t_us` (start of each control step [us]).
-        about: Plain facts: sensor settings, scenes, seed.
+        about: JSON values: sensor settings, scenes, seed.
     """
 
     events: np.ndarray
@@ -41,12 +41,12 @@ class Recording:
     about: dict[str, Any]
 
     def count_until(self, t_us: int) -> int:
-        """Return how many events have t <= t_us [us]; numpy's search would copy the times of all."""
+        """Return the number of events with t <= t_us [us]; numpy's search would copy all times."""
         return bisect.bisect_right(self.events["t"], t_us)
 
 
 def write_recording(path: Path, recording: Recording) -> None:
-    """Write events, index and facts to an HDF5 file; the file appears whole or not at all.
+    """Write events, index and `about` to an HDF5 file, atomically.
 
     Raises:
         ValueError: The events are not of dtype EVENT or not sorted by time.
@@ -58,7 +58,7 @@ def write_recording(path: Path, recording: Recording) -> None:
     offset = int(events["t"][0]) if len(events) else 0
     t_us = events["t"] - offset
     check_span(path, t_us)
-    # Made in memory, where it takes its packed size: HDF5 crashes the process on a full disk.
+    # Built in memory, in its packed size, because HDF5 crashes the process on a full disk.
     with h5py.File(path.name, "w", driver="core", backing_store=False) as file:
         columns = {"t": t_us, "x": events["x"], "y": events["y"], "p": (events["p"] > 0).astype(np.uint8)}
         for name, values in columns.items():
@@ -76,10 +76,10 @@ def write_recording(path: Path, recording: Recording) -> None:
 
 
 def check_span(path: Path, t_us: np.ndarray) -> None:
-    """Refuse times [us] since the first event that an index of milliseconds cannot tell.
+    """Check that times [us] since the first event fit into an index of milliseconds.
 
     Raises:
-        ValueError: The last of them is too long after the first event.
+        ValueError: The last time is too long after the first event.
     """
     if len(t_us) and t_us[-1] >= 1000 * MAX_INDEX:
         raise ValueError(
@@ -89,11 +89,11 @@ def check_span(path: Path, t_us: np.ndarray) -> None:
 
 
 def read_recording(path: Path) -> Recording:
-    """Read a file that `write_recording` wrote.
+    """Read a file written by `write_recording`.
 
     Raises:
         ValueError: The file is no such file, is truncated, links to other files, or declares
-            more events than `MAX_EVENTS`; nothing is allocated before that is known.
+            more events than `MAX_EVENTS`; all this is checked before memory is allocated.
     """
     try:
         check_file(path, MAX_BYTES)
@@ -111,13 +111,13 @@ def read_recording(path: Path) -> Recording:
 
 
 def milliseconds_to_index(t_us: np.ndarray) -> np.ndarray:
-    """Return the first event at or after each whole millisecond, as DSEC has it: t[i[ms]] >= ms * 1000."""
+    """Return the index of the first event at or after each millisecond, as in DSEC: t[i[ms]] >= ms * 1000."""
     last_ms = int(t_us[-1]) // 1000 if len(t_us) else 0
     return np.searchsorted(t_us, np.arange(last_ms + 1, dtype=np.int64) * 1000).astype(np.uint64)
 
 
 def _events(request: Request, file: h5py.File) -> np.ndarray:
-    """Return the events as they are stored, times with their offset."""
+    """Return the stored events, with the offset added to their times."""
     count = declared_length(file, "events/t", request.max_events)
     columns = []
     for name in ("t", "x", "y", "p"):

@@ -1,11 +1,11 @@
-"""Look into HDF5 files that may be damaged, hostile or cut off; sizes are checked before memory is taken.
+"""Read HDF5 files that may be damaged, hostile or truncated; check sizes before memory is allocated.
 
-The library crashes on some damaged files, follows links to other files, and reads texts that lead in a
-circle for ever. What could do so is refused here before the library sees it.
+The library crashes on some damaged files, follows links to other files, and loops for ever on a heap of texts
+that contains a cycle. This module detects such files before the library reads them.
 
-It refuses a file that is shorter than its first block declares, as a full disk or a copy that stopped leaves
-it. Here such a file has the declared length, and what is missing cannot be read, so that the rows before the
-first missing chunk are whole.
+The library also rejects a file that is shorter than its first block declares, such as after a full disk or an
+interrupted copy. Here such a file appears to have the declared length, and reading a missing part raises an
+error, so that the rows before the first missing chunk can be read.
 """
 
 import contextlib
@@ -25,24 +25,24 @@ from envs.recordings.event_file import CUT_PACKETS, Request, check_declared
 
 MAX_CHUNK_BYTES = 1 << 28
 # Filters that event files use: deflate, shuffle, fletcher32, lzf, blosc, blosc2. Others (nbit,
-# bitshuffle) crashed on damaged files, or (lz4, zstd) take the memory that the data declare.
+# bitshuffle) crashed on damaged files, or (lz4, zstd) allocate whatever size the data declare.
 FILTERS = (1, 2, 3, 32000, 32001, 32026)
 BLOSC = (32001, 32026)
 FLETCHER32, CHECKSUM_BYTES = 3, 4
-SIMPLE = (h5py.h5t.TypeIntegerID, h5py.h5t.TypeFloatID, h5py.h5t.TypeStringID)  # types of attributes
-HEAP = b"GCOL\1"  # begins a heap of values of variable length, such as the texts of attributes
-ERRORS = (OSError, KeyError, ValueError, RuntimeError, TypeError, OverflowError)  # of the library
+SIMPLE = (h5py.h5t.TypeIntegerID, h5py.h5t.TypeFloatID, h5py.h5t.TypeStringID)  # allowed types of attributes
+HEAP = b"GCOL\1"  # start of a heap of values of variable length, such as the texts of attributes
+ERRORS = (OSError, KeyError, ValueError, RuntimeError, TypeError, OverflowError)  # errors of the library
 MAGIC = b"\x89HDF\r\n\x1a\n"
 END_AT = {0: 40, 1: 44, 2: 28, 3: 28}  # byte of the declared length, by the version of the first block
 SIZE_AT = {0: 13, 1: 13, 2: 9, 3: 9}  # byte of the number of bytes of an address, which is 8
 HEAD_BYTES, ADDRESS_BYTES = 64, 8
-CUT_ERRORS = (OSError, RuntimeError)  # of reading what is missing
-MAX_NODES, MAX_DEPTH = 10_000, 5  # of a listing
+CUT_ERRORS = (OSError, RuntimeError)  # errors of reading a missing part
+MAX_NODES, MAX_DEPTH = 10_000, 5  # limits of a listing
 
 
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[h5py.File]:
-    """Open a file whose heaps do not lead in a circle, also if it was cut off."""
+    """Open a file, also a truncated one, after checking that its heaps contain no cycle."""
     check_heaps(path)
     length = _declared_bytes(path)
     source: AbstractContextManager[Any] = contextlib.nullcontext(path)
@@ -61,7 +61,7 @@ class CutFile(io.FileIO):
         self._path, self._length, self._end = path, length, path.stat().st_size
 
     def __repr__(self) -> str:
-        """Return the path, which HDF5 takes for the file's name."""
+        """Return the path, which HDF5 uses as the file's name."""
         return str(self._path)
 
     def seek(self, offset: int, whence: int = 0) -> int:
@@ -69,19 +69,19 @@ class CutFile(io.FileIO):
         return super().seek(self._length + offset) if whence == 2 else super().seek(offset, whence)
 
     def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
-        """Read bytes that are there."""
+        """Read bytes; raise OSError if some of them are missing."""
         if self.tell() + len(buffer) > self._end:
             raise OSError(f"the file was cut off at byte {self._end}")
         return super().readinto(buffer) or 0
 
 
 def is_cut(file: h5py.File) -> bool:
-    """Whether an open file was cut off."""
+    """Whether an open file is truncated."""
     return bool(file.driver == "fileobj")
 
 
 def _declared_bytes(path: Path) -> int:
-    """Return the length that the first block of a file declares [bytes]; 0 if it is of an unknown kind."""
+    """Return the length that the first block of a file declares [bytes]; 0 if its version is unknown."""
     with path.open("rb") as file:
         head = file.read(HEAD_BYTES)
     version = head[len(MAGIC)] if len(head) == HEAD_BYTES and head.startswith(MAGIC) else -1
@@ -92,7 +92,7 @@ def _declared_bytes(path: Path) -> int:
 
 
 def attribute(file: h5py.File, name: str) -> Any:
-    """Return one number or text; another type that damage declares, such as a list, can crash HDF5."""
+    """Return an attribute that is one number or text; any other type in a damaged file can crash HDF5."""
     stored = file.attrs.get_id(name)
     if stored.shape != () or not isinstance(stored.get_type(), SIMPLE):
         raise ValueError(f"the attribute {name} is no single number or text")
@@ -101,7 +101,7 @@ def attribute(file: h5py.File, name: str) -> Any:
 
 
 def numbers(file: h5py.File, name: str, most: int) -> list[int] | None:
-    """Return an attribute that is a short list of whole numbers, or None."""
+    """Return an attribute that is a list of at most `most` integers; None if it is something else."""
     stored = file.attrs.get_id(name)
     if len(stored.shape) != 1 or stored.shape[0] > most or not isinstance(stored.get_type(), SIMPLE[:1]):
         return None
@@ -109,7 +109,7 @@ def numbers(file: h5py.File, name: str, most: int) -> list[int] | None:
 
 
 def data_sets(file: h5py.File) -> dict[str, h5py.Dataset]:
-    """Return the data sets of this very file by their paths, with few levels and no links."""
+    """Return the data sets of a file by their paths, down to `MAX_DEPTH` levels, without links."""
     found: dict[str, h5py.Dataset] = {}
     nodes = 0
     waiting: list[tuple[str, h5py.Group, int]] = [("", file, 0)]
@@ -130,7 +130,7 @@ def data_sets(file: h5py.File) -> dict[str, h5py.Dataset]:
 
 
 def listing(file: h5py.File, most: int = 12) -> str:
-    """Return what a file contains, in words."""
+    """Describe the contents of a file in words."""
     found = data_sets(file)
     shown = [f"{name} {data.dtype} {data.shape}" for name, data in list(found.items())[:most]]
     more = f" and {len(found) - most} more" if len(found) > most else ""
@@ -138,7 +138,7 @@ def listing(file: h5py.File, most: int = 12) -> str:
 
 
 def declared_length(file: h5py.File, name: str, most: int) -> int:
-    """Return the length of a one-dimensional data set of this very file, checked before it is read."""
+    """Return the length of a one-dimensional data set, after checking it without reading the data."""
     check_plain(file, name, 1)
     length = len(file[name])
     if length > most:
@@ -148,7 +148,7 @@ def declared_length(file: h5py.File, name: str, most: int) -> int:
 
 
 def time_offset(file: h5py.File) -> int:
-    """Return the time of t = 0 [us], which files of the DSEC layout say; 0 if this one does not.
+    """Return the time of t = 0 [us] that a file in DSEC's layout states; 0 if it states none.
 
     Raises:
         ValueError: It is no whole number.
@@ -163,7 +163,7 @@ def time_offset(file: h5py.File) -> int:
 
 
 def check_plain(file: h5py.File, name: str, ndim: int) -> None:
-    """Refuse links, virtual and external data, other types than numbers, and huge chunks."""
+    """Raise ValueError for links, virtual or external data, types other than numbers, and huge chunks."""
     data = plain(file, name, ndim)
     fields = [data.dtype[field] for field in data.dtype.names] if data.dtype.names else [data.dtype]
     if not all(field.kind in "iufb" for field in fields):
@@ -172,7 +172,7 @@ def check_plain(file: h5py.File, name: str, ndim: int) -> None:
 
 
 def plain(file: h5py.File, name: str, ndim: int) -> h5py.Dataset:
-    """Return a data set; refuse links, and virtual and external data."""
+    """Return a data set; raise ValueError for a link, and for virtual or external data."""
     parts = name.split("/")
     for end in range(1, len(parts) + 1):
         check_own(file, "/".join(parts[:end]))
@@ -183,13 +183,13 @@ def plain(file: h5py.File, name: str, ndim: int) -> h5py.Dataset:
 
 
 def check_own(file: h5py.File, name: str) -> None:
-    """Refuse a name that leads elsewhere, before it is followed: another file would be opened."""
+    """Raise ValueError for a name that is a link, before following it could open another file."""
     if not isinstance(file.get(name, getlink=True), h5py.HardLink):
         raise ValueError(f"{name} is missing or a link")
 
 
 def check_chunks(data: h5py.Dataset, name: str) -> None:
-    """Refuse huge chunks, and filters that are unknown or declare another size of elements or chunks."""
+    """Raise ValueError for huge chunks, and for filters that are unknown or declare the wrong sizes."""
     if data.chunks and int(np.prod(data.chunks, dtype=object)) * data.dtype.itemsize > MAX_CHUNK_BYTES:
         raise ValueError(f"{name} has chunks of more than {MAX_CHUNK_BYTES} bytes")
     pipeline, codes = data.id.get_create_plist(), filters(data)
@@ -199,23 +199,23 @@ def check_chunks(data: h5py.Dataset, name: str) -> None:
         size = int(np.prod(data.chunks, dtype=object)) * data.dtype.itemsize if data.chunks else 0
         if code in BLOSC and pipeline.get_filter(number)[2][2:4] != (data.dtype.itemsize, size):
             raise ValueError(f"{name} describes its packing wrongly")
-    if FLETCHER32 in codes[:-1]:  # what decompression leaves may be too short for it
+    if FLETCHER32 in codes[:-1]:  # the decompressed data may be too short for it
         raise ValueError(f"{name} has its checksum within its compression; write it again without fletcher32")
-    # Of a file that was cut off the list of chunks may be missing: `_read_rows` looks at each chunk.
+    # A truncated file may lack the list of chunks; `_read_rows` then checks each chunk.
     if FLETCHER32 in codes and not is_cut(data.file) and data.id.chunk_iter(_too_short):
         raise ValueError(f"{name} has a chunk without its checksum")
 
 
 def _too_short(chunk: Any) -> bool | None:
-    """Whether a stored chunk has no room for its checksum, in front of which HDF5 would look for it."""
+    """Return True if a stored chunk is too short for its checksum, else None to continue the iteration."""
     return chunk.size < CHECKSUM_BYTES or None
 
 
 def row_parts(request: Request, sets: Sequence[h5py.Dataset]) -> Iterator[slice]:
-    """Yield the rows of data sets of one length, part by part, up to the first that was cut off, if one was.
+    """Yield the rows of data sets of equal length, part by part, up to the first missing row.
 
     Args:
-        request: The file, in whose tally the cut is counted.
+        request: The file; its tally counts missing rows as damage.
         sets: The data sets.
     """
     for first in range(0, len(sets[0]), request.part_events):
@@ -226,7 +226,7 @@ def row_parts(request: Request, sets: Sequence[h5py.Dataset]) -> Iterator[slice]
 
 
 def _until_cut(request: Request, rows: slice, sets: Sequence[h5py.Dataset]) -> slice:
-    """Return the rows up to the first that is missing, which is counted."""
+    """Return the rows up to the first missing one, and count that as damage."""
 
     def are_whole(some: slice) -> bool:
         try:
@@ -248,7 +248,7 @@ def _until_cut(request: Request, rows: slice, sets: Sequence[h5py.Dataset]) -> s
 
 
 def _read_rows(data: h5py.Dataset, rows: slice) -> np.ndarray:
-    """Return rows of a data set of a file that was cut off, after a look at its chunks."""
+    """Return rows of a data set of a truncated file, after checking the sizes of its chunks."""
     if FLETCHER32 in filters(data):
         columns = range(0, data.shape[1], data.chunks[1]) if data.ndim > 1 else [None]
         for first in range(rows.start // data.chunks[0] * data.chunks[0], rows.stop, data.chunks[0]):
@@ -260,13 +260,13 @@ def _read_rows(data: h5py.Dataset, rows: slice) -> np.ndarray:
 
 
 def filters(data: h5py.Dataset) -> list[int]:
-    """Return the numbers of the filters that packed a data set."""
+    """Return the numbers of the filters of a data set."""
     pipeline = data.id.get_create_plist()
     return [pipeline.get_filter(number)[0] for number in range(pipeline.get_nfilters())]
 
 
 def check_heaps(path: Path) -> None:
-    """Refuse a heap of texts with an object that is its own next one: HDF5 would read it for ever."""
+    """Raise ValueError for a heap of texts in which an object follows itself: HDF5 would loop for ever."""
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as raw:
         heap = raw.find(HEAP)
         while heap >= 0:

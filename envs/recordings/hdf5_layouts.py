@@ -1,4 +1,4 @@
-"""Read events from HDF5 files: a table of known layouts, and any other by `group` and `columns`."""
+"""Read events from HDF5 files in known layouts (`LAYOUTS`), or in any other by `group` and `columns`."""
 
 import json
 import re
@@ -27,19 +27,19 @@ from envs.recordings.hdf5_checks import (
 from envs.recordings.names import COLUMNS, column_of, microseconds, roles, usual_unit
 from envs.recordings.npz import FIRST_ROWS, table_order
 
-NOISE = "events/is_noise"  # labels, where there are any
+NOISE = "events/is_noise"  # labels, optional
 UNREADABLE = "is no readable HDF5 event file ({}); copy or write it again"
 
 
 class Layout(NamedTuple):
-    """Where a data set has its events.
+    """Location and form of the events in the files of some data sets and programs.
 
     Attributes:
-        users: Data sets and programs that write it.
+        users: Data sets and programs that use the layout.
         group: Path of the group or of the one data set of rows.
         columns: Data sets of t, x, y and p in the group, or the columns of the rows in their order.
-        time_unit: Of fractional times; whole ones are microseconds.
-        size: Width and height, if all files have one and do not say it.
+        time_unit: Unit of fractional times; whole times are microseconds.
+        size: Width and height, if all files have the same size and do not state it.
     """
 
     users: str
@@ -60,18 +60,18 @@ LAYOUTS = (
     Layout("EDS", ""),
     Layout("RPEFlow", "", ("events_t", "events_x", "events_y", "events_p")),
 )
-# Sizes by the types of DSEC, whose files have an offset and an index of milliseconds.
+# Files with these types, an offset and an index of milliseconds are DSEC's and have this size.
 DSEC_TYPES, DSEC_SIZE = {"t": "u4", "x": "u2", "y": "u2", "p": "u1"}, (640, 480)
 
 
 class Found(NamedTuple):
-    """Where the events of a file are.
+    """Location of the events in a file.
 
     Attributes:
         group: As in `Layout`.
-        paths: Data sets of t, x, y and p; or the one of rows, four times.
+        paths: Data sets of t, x, y and p; or the one data set of rows, four times.
         fields: Fields or columns of the rows, or None four times.
-        layout: Its row of the table, or None.
+        layout: The matching row of `LAYOUTS`, or None.
     """
 
     group: str
@@ -84,8 +84,8 @@ def read_hdf5(request: Request) -> Opened:
     """Open an HDF5 file.
 
     Raises:
-        ValueError: It has no layout that is known, is truncated, links to other files, or declares more
-            than `max_events`.
+        ValueError: The file has no known layout, is damaged, links to other files, or declares more than
+            `max_events` events.
     """
     with request.refusing(ERRORS, UNREADABLE), opened(request.path) as file:
         if "CD" in file and request.group is None:
@@ -105,10 +105,10 @@ def read_hdf5(request: Request) -> Opened:
 
 
 def find(request: Request, file: h5py.File) -> tuple[Found, list[str]]:
-    """Return where the events are, and other groups that have events too.
+    """Return the location of the events, and all groups with events if there are several.
 
     Raises:
-        ValueError: No layout is known; the message lists what the file contains.
+        ValueError: The file has no known layout; the message lists the contents of the file.
     """
     sets = data_sets(file)
     if request.group is not None or request.columns is not None:
@@ -119,7 +119,7 @@ def find(request: Request, file: h5py.File) -> tuple[Found, list[str]]:
         groups = sorted({path.rpartition("/")[0] for path in sets})
         found = [one for group in groups if (one := _by_roles(request, sets, group))]
     if not found:
-        for name in ("events/t", "events"):  # says what is wrong with data sets that should be there
+        for name in ("events/t", "events"):  # raises an error about expected data sets that are invalid
             if name.split("/")[0] in file and not sets:
                 check_plain(file, name, 1)
         known = "; ".join(f"{row.users}: {row.group or '/'}" for row in LAYOUTS)
@@ -134,7 +134,7 @@ def find(request: Request, file: h5py.File) -> tuple[Found, list[str]]:
 def _matched(
     request: Request, file: h5py.File, sets: dict[str, h5py.Dataset], layout: Layout
 ) -> Found | None:
-    """Return where the events are if a file has a layout."""
+    """Return the location of the events if the file has this layout, else None."""
     if layout.group in sets:
         data = sets[layout.group]
         if data.dtype.names:
@@ -148,7 +148,7 @@ def _matched(
 
 
 def _has(file: h5py.File, path: str) -> bool:
-    """Whether a path begins with a name of the file; what it leads to is checked later."""
+    """Whether a path exists in the file, up to the first link; links are checked later."""
     parts = path.split("/")
     group: Any = file
     for part in parts[:-1]:
@@ -161,7 +161,7 @@ def _has(file: h5py.File, path: str) -> bool:
 
 
 def _named(request: Request, file: h5py.File, sets: dict[str, h5py.Dataset]) -> Found:
-    """Return the events that the caller names by `group` and `columns`."""
+    """Return the location of the events that the caller names by `group` and `columns`."""
     group = (request.group or "").strip("/")
     if request.group is None and "events" in sets:
         group = "events"
@@ -190,7 +190,7 @@ def _named(request: Request, file: h5py.File, sets: dict[str, h5py.Dataset]) -> 
 
 
 def _by_roles(request: Request, sets: dict[str, h5py.Dataset], group: str) -> Found | None:
-    """Return the events of a group by the names of its data sets, whatever their spelling."""
+    """Return the location of the events in a group by any known names of its data sets, or None."""
     paths = [path for path, data in sets.items() if path.rpartition("/")[0] == group and data.ndim == 1]
     places, _ = roles(request, [path.rpartition("/")[2].removeprefix("events_") for path in paths])
     if not set(COLUMNS) <= places.keys():
@@ -199,7 +199,7 @@ def _by_roles(request: Request, sets: dict[str, h5py.Dataset], group: str) -> Fo
 
 
 def _fields(request: Request, path: str, data: h5py.Dataset, columns: tuple[str, ...] | None) -> Found | None:
-    """Return the events of a data set of rows with named fields."""
+    """Return the location of the events in a data set of rows with named fields, or None."""
     names = data.dtype.names or ()
     if columns is None:
         places, _ = roles(request, names)
@@ -210,7 +210,7 @@ def _fields(request: Request, path: str, data: h5py.Dataset, columns: tuple[str,
 
 
 def _table(path: str, columns: tuple[str, ...]) -> Found | None:
-    """Return the events of a data set of rows without names."""
+    """Return the location of the events in a data set of rows without names, or None."""
     if not set(COLUMNS) <= set(columns):
         return None
     return Found(path, (path,) * 4, tuple(columns.index(name) for name in COLUMNS))
@@ -234,7 +234,7 @@ def _metavision(request: Request) -> Iterator[Part]:
 
 
 def _parts(request: Request, found: Found, count: int) -> Iterator[Part]:
-    """Yield the events where they were found."""
+    """Yield the events from the location that was found."""
     with request.refusing(ERRORS, UNREADABLE), opened(request.path) as file:
         paths = list(dict.fromkeys(found.paths))
         for path in paths:
@@ -268,7 +268,7 @@ def _part(
 
 
 def _sized(request: Request, file: h5py.File, found: Found) -> Request:
-    """Return the request with the size that the file says, or that its data set has."""
+    """Return the request with the sensor's size from the file, or else the usual size of its layout."""
     width, height = _said_size(file, found.group)
     if (width, height) == (None, None) and (request.width, request.height) == (None, None):
         usual = found.layout.size if found.layout else None
@@ -280,7 +280,7 @@ def _sized(request: Request, file: h5py.File, found: Found) -> Request:
 
 
 def _said_size(file: h5py.File, group: str) -> tuple[int | None, int | None]:
-    """Return width and height as far as the file says them, and what says so was not cut off."""
+    """Return width and height as stated in the file; None if not stated, or lost in a truncated file."""
     try:
         return _size_of(file, group)
     except CUT_ERRORS:
@@ -290,7 +290,7 @@ def _said_size(file: h5py.File, group: str) -> tuple[int | None, int | None]:
 
 
 def _size_of(file: h5py.File, group: str) -> tuple[int | None, int | None]:
-    """Return width and height by attributes, by data sets beside the events, or by a recording's settings."""
+    """Return width and height from attributes, data sets next to the events, or a recording's settings."""
     given = file.attrs
     if "width" in given and "height" in given:
         return int(attribute(file, "width")), int(attribute(file, "height"))

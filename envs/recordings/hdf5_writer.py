@@ -1,4 +1,4 @@
-"""Write events as HDF5 in the layout of DSEC, in parts, so that every reader of HDF5 opens them."""
+"""Write events as HDF5 in DSEC's layout, in parts, with filters that every HDF5 reader supports."""
 
 import contextlib
 import io
@@ -15,9 +15,9 @@ from envs.recordings.hdf5_layouts import NOISE
 
 CHUNK = 1 << 16
 TYPES = {"events/t": "i8", "events/x": "u2", "events/y": "u2", "events/p": "u1"}
-# Filters that are part of HDF5 itself; other ones need a plug-in that C++ and MATLAB do not have.
+# Filters that are part of HDF5 itself; others need a plug-in that C++ and MATLAB do not have.
 PACKING = {"compression": "gzip", "compression_opts": 1, "shuffle": True, "fletcher32": True}
-FILL_MS = 1 << 20  # entries of the index that are made at once
+FILL_MS = 1 << 20  # entries of the index that are written at once
 
 
 @contextlib.contextmanager
@@ -25,7 +25,7 @@ def hdf5_writer(path: Path, width: int, height: int, is_labelled: bool) -> Itera
     """Yield a function that adds events to an HDF5 file, with the sensor's size as attributes.
 
     Raises:
-        ValueError: They last longer than an index of milliseconds can tell.
+        ValueError: The events last too long for an index of milliseconds.
     """
     types = TYPES | ({NOISE: "u1"} if is_labelled else {})
     with replaced(path) as part, Forgiving(part, "w+") as target:
@@ -41,7 +41,7 @@ def hdf5_writer(path: Path, width: int, height: int, is_labelled: bool) -> Itera
 
 
 class Forgiving(io.FileIO):
-    """A file whose errors are told later: HDF5 crashes the process if a write fails, as on a full disk."""
+    """A file that defers write errors: HDF5 crashes the process if a write fails, as on a full disk."""
 
     error: OSError | None = None
 
@@ -71,10 +71,10 @@ class Forgiving(io.FileIO):
 
 
 class Adding:
-    """Adds events to the data sets of a file, whole chunks at a time."""
+    """Add events to the data sets of a file, at most one chunk at a time."""
 
     def __init__(self, path: Path, file: h5py.File, target: Forgiving) -> None:
-        """Begin with empty data sets."""
+        """Start with empty data sets."""
         self._path, self._file, self._target = path, file, target
         self._offset_us: int | None = None
         self._count, self._next_ms = 0, 0
@@ -82,7 +82,7 @@ class Adding:
     def __call__(self, events: np.ndarray, is_noise: np.ndarray | None) -> None:
         """Add events; raises ValueError if they last too long, OSError if the disk is full.
 
-        Some rows of all columns at a time, so that a file that is cut off has whole events.
+        Rows are written for all columns at a time, so that a truncated file contains whole events.
         """
         for first in range(0, len(events), CHUNK):
             rows = slice(first, first + CHUNK)
@@ -112,7 +112,7 @@ class Adding:
         data[first:] = values
 
     def _index(self, t_us: np.ndarray) -> None:
-        """Add the first event at or after each millisecond that has come."""
+        """Extend the index by the first event at or after each new millisecond."""
         stop = int(t_us[-1]) // 1000 + 1
         for first in range(self._next_ms, stop, FILL_MS):
             ms = np.arange(first, min(stop, first + FILL_MS), dtype=np.int64)

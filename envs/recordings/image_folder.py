@@ -1,4 +1,4 @@
-"""Find the images of a folder and their times: by a list, as data sets have it, or a frame rate."""
+"""Find the images of a folder and their times, from the lists of known data sets or a frame rate."""
 
 import math
 import re
@@ -20,10 +20,10 @@ class List(NamedTuple):
     """A text file with a line for each image.
 
     Attributes:
-        name: Of the file.
-        users: Who writes it.
-        columns: In a line, "time" and "name"; without names the images are in the order of their numbers.
-        unit_us: The unit of the times [us].
+        name: Name of the file.
+        users: Data set or program that writes it.
+        columns: Columns of a line, "time" and "name"; without names, images are sorted by their numbers.
+        unit_us: Unit of the times [us].
     """
 
     name: str
@@ -45,17 +45,17 @@ NUMBER = re.compile(r"\d+(\.\d*)?([eE][+-]?\d+)?")
 def find_images(folder: Path, fps: float | None, max_bytes: int) -> tuple[list[Path], list[int]]:
     """Return the images of a folder in the order of their times, and their times [us].
 
-    With a list of `LISTS` they are those of the list; else all images of the folder, or of a subfolder, by
-    their names, numbers in them by their value.
+    If the folder has a list (`LISTS`), these are the images of the list. Otherwise they are all images of the
+    folder, or of a subfolder, sorted by name, with numbers in names sorted by value.
 
     Args:
         folder: The folder.
-        fps: Images per second, in place of the times of a list.
-        max_bytes: Most bytes of all images together.
+        fps: Images per second, replaces the times of a list.
+        max_bytes: Maximum size of all images together [bytes].
 
     Raises:
-        ValueError: There are no images, or no times; a line of a list is not as it should be; an image is no
-            regular file, or outside the folder.
+        ValueError: There are no images or no times, a line of a list is invalid, or an image is no regular
+            file or outside the folder.
     """
     known = next((one for one in LISTS if (folder / one.name).exists()), None)
     names, times = _read_list(folder / known.name, known) if known else ([], [])
@@ -98,12 +98,12 @@ def _images(folder: Path) -> list[Path]:
 
 
 def even_time_us(number: int, fps: float) -> int:
-    """Return the time [us] of a frame by its number at a rate; frame 0 has 0."""
+    """Return the time [us] of frame `number` at a constant rate; frame 0 is at 0."""
     return round(1_000_000 * number / Fraction(fps))
 
 
 def check_fps(fps: float | None) -> None:
-    """Raise ValueError for a rate at which frames are not a microsecond or more apart."""
+    """Raise ValueError unless the rate is positive and frames are at least a microsecond apart."""
     if fps is not None and not (math.isfinite(fps) and 0.0 < fps <= 1e6):
         raise ValueError(f"fps must lie in (0, 1e6], got {fps}")
 
@@ -150,7 +150,7 @@ def _inside(folder: Path, listed: Path, name: str) -> Path:
     """Return the path of an image of a list.
 
     Raises:
-        ValueError: It is outside the folder; a list may come from elsewhere.
+        ValueError: The path is outside the folder; a list may come from an untrusted source.
     """
     path = Path(name)
     if path.is_absolute() and path.parent.name == folder.resolve().name:
@@ -161,6 +161,6 @@ def _inside(folder: Path, listed: Path, name: str) -> Path:
 
 
 def _by_number(path: Path) -> list[tuple[int, int, str]]:
-    """Return a key that sorts names as people count: frame_2 before frame_10."""
+    """Return a key for natural sorting of names: frame_2 before frame_10."""
     parts = re.findall(r"(\d+)|(\D+)", path.name)
     return [(0, int(digits), digits) if digits else (1, 0, text) for digits, text in parts]

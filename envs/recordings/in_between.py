@@ -1,8 +1,8 @@
-"""Frames between two frames, by the motion of what both show; OpenCV computes it (the extra `flow`).
+"""Interpolate frames between two frames by optical flow, which OpenCV computes (the extra `flow`).
 
-The motion is dense inverse search (Kroeger et al. 2016, arXiv:1603.03590), from each frame to the other. At
-a moment between them both are moved there and blended, by equations 1 and 4 of Super SloMo (Jiang et al.
-2018, arXiv:1712.00080), in log luminance, as the event camera sees it.
+The flow is dense inverse search (Kroeger et al. 2016, arXiv:1603.03590), from each frame to the other. For a
+time between them, both frames are warped to that time and blended, by equations 1 and 4 of Super SloMo (Jiang
+et al. 2018, arXiv:1712.00080), in log luminance, as the event camera sees it.
 """
 
 from collections.abc import Iterator
@@ -10,15 +10,15 @@ from types import ModuleType
 
 import numpy as np
 
-SMALLEST = 32  # rows and columns below which no motion is found
-MOST_PARTS = 16  # of the time between two frames
+SMALLEST = 32  # minimum rows and columns to compute the flow
+MOST_PARTS = 16  # maximum number of intervals between two frames
 
 
 def open_cv() -> ModuleType:
-    """OpenCV, which is imported only here.
+    """Import and return OpenCV, which no other module imports.
 
     Raises:
-        ValueError: It is not installed.
+        ValueError: OpenCV is not installed.
     """
     try:
         import cv2
@@ -31,17 +31,17 @@ def open_cv() -> ModuleType:
 def frames_between(
     first: np.ndarray, second: np.ndarray, floor: float, most_parts: int = MOST_PARTS
 ) -> Iterator[tuple[float, np.ndarray]]:
-    """Pictures between two others, so many that little moves by more than a pixel from one to the next.
+    """Yield pictures between two frames, so many that few pixels move by more than a pixel per step.
 
     Args:
         first: float32 (H, W), linear luminance, 32 x 32 pixels or more.
-        second: The same, of the next frame.
+        second: The next frame, in the same form.
         floor: Added to luminance before the logarithm.
-        most_parts: Into which the time between the two is cut, at most 16.
+        most_parts: Maximum number of intervals between the frames, at most 16.
 
     Yields:
-        Share of the time between the two, in (0, 1) and increasing, and float32 (H, W) of that moment;
-        nothing if nothing moves.
+        Fraction of the time between the frames, in (0, 1) and increasing, and the picture float32 (H, W) at
+        that time; nothing if nothing moves.
 
     Raises:
         ValueError: OpenCV is not installed, or the pictures are too small.

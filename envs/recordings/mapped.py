@@ -1,4 +1,4 @@
-"""Map a file into memory, and let go of what has been read."""
+"""Map a file into memory, and release the pages that have been read."""
 
 import contextlib
 import mmap
@@ -17,8 +17,8 @@ def mapped(
     """Map a file from byte `start` on, without copying it into memory.
 
     Returns:
-        `count` entries of the dtype, and a function that takes the entries before a place out of memory;
-        they are read again if they are needed.
+        `count` entries of the dtype, and a function that releases the memory of the entries before an
+        index; a later access reads them again.
     """
     with request.path.open("rb") as file:
         whole = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)

@@ -1,4 +1,4 @@
-"""Recognise the columns of events by the names that programs give them."""
+"""Recognise the columns of events by the names that programs use for them."""
 
 import re
 from collections.abc import Iterable
@@ -21,7 +21,7 @@ NAME = re.compile(r"(.*?)(?:[_\[( ](s|ms|us|ns)[\])]?)?", re.DOTALL)
 
 
 def roles(request: Request, names: Iterable[str]) -> tuple[dict[str, int], str | None]:
-    """Return the place of each column that is known by its name, and the unit of t that its name tells.
+    """Return the index of each column with a known name, and the unit of t if its name states one.
 
     Raises:
         ValueError: Two columns have the same name.
@@ -49,10 +49,10 @@ def column_of(rows: np.ndarray, field: str | int | None) -> np.ndarray:
 
 
 def microseconds(request: Request, t: np.ndarray, said: str | None, usual: str | None = None) -> np.ndarray:
-    """Return times in microseconds by the unit that the file says, else the caller, else the format.
+    """Convert times to microseconds from the unit of the file, else of the caller, else of the format.
 
     Raises:
-        ValueError: The file and the caller name different units, or nobody names one.
+        ValueError: The file and the caller state different units, or none is known.
     """
     given = request.time_unit
     if said and given and said != given:
@@ -72,7 +72,7 @@ def microseconds(request: Request, t: np.ndarray, said: str | None, usual: str |
 
 
 def usual_unit(t: np.ndarray) -> str | None:
-    """Return "us" for whole numbers, which all known writers mean as microseconds, else None."""
+    """Return "us" for whole numbers, which are microseconds in all known formats, else None."""
     if t.dtype.kind in "iub":
         return "us"
     return "us" if len(t) and bool(np.all(t[np.isfinite(t)] % 1 == 0)) else None

@@ -1,4 +1,4 @@
-"""Read N-MNIST and N-Caltech101: 40 bits an event, x 8, y 8, p 1, t 23 (microseconds)."""
+"""Read N-MNIST and N-Caltech101: 40 bits per event, x 8, y 8, p 1, t 23 (microseconds)."""
 
 from collections.abc import Iterator
 
@@ -15,8 +15,8 @@ OVERFLOW_ROW, OVERFLOW_US = 240, 1 << 13
 def read_nmnist(request: Request) -> Opened:
     """Open an N-MNIST or N-Caltech101 file; the size is N-MNIST's unless the caller gives another.
 
-    Row 240 marks an overflow of the camera's own counter: it is no event, and moves what
-    follows by 8,192 us, as the data set's reader has it. The 23-bit clock of 8.4 s is unwrapped.
+    Row 240 marks an overflow of the camera's own counter: it is no event, and shifts all later
+    times by 8,192 us, as in the data set's own reader. The 23-bit clock of 8.4 s is unwrapped.
     """
     count = request.check_declared(whole_entries(request, 0, 5))
     if request.width is None and request.height is None:
@@ -25,7 +25,7 @@ def read_nmnist(request: Request) -> Opened:
 
 
 def _parts(request: Request, count: int) -> Iterator[Part]:
-    """Yield the events of entries of 5 bytes."""
+    """Yield the events of the 5-byte entries."""
     last_us, turns = -1, 0
     for raw in mapped_parts(request, 0, np.dtype("V5"), count):
         body = raw.view(np.uint8).reshape(-1, 5)

@@ -1,7 +1,7 @@
-"""Read npz and npy files of any names, and zip files of one text; write npz files.
+"""Read npz and npy files with any array names, and zip files of one text file; write npz files.
 
-Arrays are found by their names. Nothing is unpickled, and nothing is unpacked before its header is known
-to be sound. Columns are read side by side, in parts.
+Arrays are found by their names. Nothing is unpickled, and nothing is unpacked before its header has been
+checked. Columns are read in parallel, in parts.
 """
 
 import contextlib
@@ -23,13 +23,13 @@ from envs.recordings.npz_cut import cut_members
 from envs.recordings.text import read_text
 
 MAX_HEADER_BYTES = 1 << 16
-NOISE = "is_noise"  # an array that labels each event, if there is one
+NOISE = "is_noise"  # optional array with a label for each event
 ROWS = 4  # columns of a table
-FIRST_ROWS = 1 << 16  # by which the order of the columns of a table is told
+FIRST_ROWS = 1 << 16  # rows from which the order of the columns of a table is inferred
 WRITTEN = {name: np.dtype(code) for name, code in (("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "u1"))}
 BROKEN = (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, ValueError)
 UNREADABLE = "is no readable array file ({}); copy or save it again"
-# Sizes of the data sets whose files do not say them, by the name of their array.
+# Name of the array -> sensor size, for data sets whose files do not state it.
 SIZES = {"event_data": (640, 480)}  # N-ImageNet
 SECONDS = ("events_t",)  # names of times in seconds: EVIMO 2
 
@@ -38,9 +38,9 @@ class Array(NamedTuple):
     """An array of a file.
 
     Attributes:
-        name: In the file.
-        open: Opens its bytes, from its header on.
-        shape, dtype: As its header declares.
+        name: Name in the file.
+        open: Function that opens its bytes, from the header on.
+        shape, dtype: As declared in the header.
     """
 
     name: str
@@ -50,7 +50,7 @@ class Array(NamedTuple):
 
 
 class Column(NamedTuple):
-    """Where a column of the events is.
+    """Location of a column of the events.
 
     Attributes:
         array: Name of the array.
@@ -62,15 +62,15 @@ class Column(NamedTuple):
 
 
 def read_npz(request: Request) -> Opened:
-    """Open an npz file, or a zip file of one text as E2VID has it.
+    """Open an npz file, or a zip file of one text file as in E2VID.
 
-    Arrays are t, x, y and p by these names or others in use; or one array of rows, structured or of four
-    columns; and, if known, width, height, time_unit. Whole times are microseconds unless the file or the
-    caller names another unit; fractional times need a unit.
+    Arrays are t, x, y and p, by these or other common names, or one array of rows, structured or of four
+    columns; and optionally width, height, time_unit. Whole times are microseconds unless the file or the
+    caller states another unit; fractional times need a unit.
 
     Raises:
-        ValueError: There are no such arrays, or one is pickled, of another length, or contains
-            another number of bytes than it declares.
+        ValueError: There are no such arrays, or one is pickled, differs in length, or has not the number of
+            bytes that it declares.
     """
     members, is_cut = _members(request)
     texts = [name for name in members if name.lower().endswith((".txt", ".csv"))]
@@ -99,7 +99,7 @@ def read_npy(request: Request) -> Opened:
     """Open an npy file of rows: a structured array, or a table of four columns.
 
     Raises:
-        ValueError: As `read_npz`.
+        ValueError: As in `read_npz`.
     """
     with request.refusing(BROKEN, UNREADABLE):
         array = _header(request, "rows", lambda: request.path.open("rb"))
@@ -107,7 +107,7 @@ def read_npy(request: Request) -> Opened:
 
 
 def _members(request: Request) -> tuple[dict[str, Callable[[], IO[bytes]]], bool]:
-    """Return functions that open the members of a zip file, and whether it was cut off."""
+    """Return functions that open the members of a zip file, and whether the file is truncated."""
     with request.refusing(BROKEN, UNREADABLE):
         try:
             archive = zipfile.ZipFile(request.path)
@@ -120,21 +120,21 @@ def _members(request: Request) -> tuple[dict[str, Callable[[], IO[bytes]]], bool
 
 
 def _header(request: Request, name: str, open_bytes: Callable[[], IO[bytes]]) -> Array:
-    """Return an array by the header that it declares."""
+    """Return the description of an array from its header."""
     with open_bytes() as file:
         shape, dtype = _shape(request, file, name)
     return Array(name, open_bytes, shape, dtype)
 
 
 def _shape(request: Request, file: IO[bytes], name: str) -> tuple[tuple[int, ...], np.dtype]:
-    """Read shape and dtype of an array; the file is then at its first number."""
+    """Read shape and dtype of an array; leave the file at the first value."""
     try:
         version = np.lib.format.read_magic(file)
         read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}[
             version
         ]
         shape, is_fortran, dtype = read(file, max_header_size=MAX_HEADER_BYTES)
-    except Exception as error:  # numpy's parser of headers promises no type
+    except Exception as error:  # numpy's header parser may raise any type
         raise request.refusal(
             f"array {name} has no sound header ({type(error).__name__}); save it again"
         ) from None
@@ -144,7 +144,7 @@ def _shape(request: Request, file: IO[bytes], name: str) -> tuple[tuple[int, ...
 
 
 def _opened(request: Request, format: str, arrays: dict[str, Array]) -> Opened:
-    """Find the columns of the events and the facts beside them."""
+    """Find the columns of the events, the sensor's size and the unit of time."""
     columns = _columns(request, arrays)
     if NOISE in arrays:
         columns.append(Column(NOISE, None))
@@ -170,7 +170,7 @@ def _opened(request: Request, format: str, arrays: dict[str, Array]) -> Opened:
 
 
 def _columns(request: Request, arrays: dict[str, Array]) -> list[Column]:
-    """Return where t, x, y and p are."""
+    """Return the locations of t, x, y and p."""
     found = {name: array for name, array in arrays.items() if array.shape and array.dtype.kind in "iufbV"}
     if request.group is not None:
         if request.group not in found:
@@ -199,7 +199,7 @@ def _columns(request: Request, arrays: dict[str, Array]) -> list[Column]:
 
 
 def _refuse_objects(request: Request, arrays: dict[str, Array]) -> None:
-    """Refuse an array that has the name of a column and contains no numbers."""
+    """Raise ValueError for an array that has the name of a column but contains no numbers."""
     for place in roles(request, arrays)[0].values() if request.group is None else ():
         array = list(arrays.values())[place]
         if array.dtype.kind not in "iufb":
@@ -207,7 +207,7 @@ def _refuse_objects(request: Request, arrays: dict[str, Array]) -> None:
 
 
 def _no_numbers(request: Request, array: Array) -> ValueError:
-    """Return the refusal for an array of something else."""
+    """Return the error for an array that does not contain numbers."""
     return request.refusal(
         f"array {array.name} has dtype {array.dtype} and shape {array.shape}; save numbers"
     )
@@ -219,7 +219,7 @@ def _is_rows(array: Array) -> bool:
 
 
 def _row_columns(request: Request, array: Array) -> list[Column]:
-    """Return where t, x, y and p are in an array of rows."""
+    """Return the locations of t, x, y and p in an array of rows."""
     if array.dtype.names:
         names = list(array.dtype.names)
         places, _ = roles(request, names)
@@ -240,25 +240,25 @@ def _row_columns(request: Request, array: Array) -> list[Column]:
 
 
 def table_order(request: Request, name: str, rows: np.ndarray) -> tuple[str, ...]:
-    """Return the order of the columns of a table if its numbers leave no doubt.
+    """Infer the order of the columns of a table from its numbers.
 
-    The last column is the polarity; the time is the only other column that never falls, in the first or
-    the third place.
+    The last column must be the polarity. The time is the first or third column, whichever never decreases;
+    if both never decrease, the one with the larger range.
 
     Args:
         request: The file.
-        name: The table in the file.
+        name: Name of the table in the file.
         rows: Its first rows, (N, 4).
 
     Raises:
-        ValueError: The numbers fit none or two orders.
+        ValueError: The numbers do not fit either order.
     """
     if rows.shape[1] == ROWS and len(rows):
         signs = rows[:, 3].astype(np.float64)
         signs = np.where(signs > 1 << 31, -1.0, signs)
         others = [rows[:, place].astype(np.float64) for place in (0, 2)]
         rises = [bool((np.diff(values) >= 0).all()) for values in others]
-        if rises == [True, True]:  # pixels may rise too, but no further than a sensor reaches
+        if rises == [True, True]:  # a coordinate may also increase, but only up to the size of a sensor
             is_first = bool(np.ptp(others[0]) >= np.ptp(others[1]))
             rises = [is_first, not is_first]
         if np.isin(signs, (-1, 0, 1)).all() and any(rises):
@@ -279,7 +279,7 @@ def _first_rows(request: Request, array: Array) -> np.ndarray:
 def _parts(
     request: Request, used: list[Array], columns: list[Column], unit: str | None, count: int
 ) -> Iterator[Part]:
-    """Yield the events; the arrays are read side by side."""
+    """Yield the events; the arrays are read in parallel."""
     with request.refusing(BROKEN, UNREADABLE), contextlib.ExitStack() as stack:
         files = [stack.enter_context(array.open()) for array in used]
         for file, array in zip(files, used, strict=True):
@@ -298,7 +298,7 @@ def _parts(
 def _side_by_side(
     request: Request, files: list[IO[bytes]], used: list[Array], size: int
 ) -> dict[str, np.ndarray]:
-    """Return the next rows of all arrays by their names; all end where the first ends."""
+    """Return the next rows of all arrays by their names, cut to the shortest array."""
     read = [_next(request, file, array, size) for file, array in zip(files, used, strict=True)]
     whole = min(map(len, read))
     if whole < size:
@@ -318,7 +318,7 @@ def _next(request: Request, file: IO[bytes], array: Array, size: int) -> np.ndar
 
 
 def _sized(request: Request, arrays: dict[str, Array], used: list[Array]) -> Request:
-    """Return the request with the sensor's size that the file says, or that its data set has."""
+    """Return the request with the sensor's size from the file, or else the size of its data set."""
     size = [int(_one(request, arrays, name)) if name in arrays else None for name in ("width", "height")]
     usual = SIZES.get(used[0].name)
     if usual and size == [None, None] and (request.width, request.height) == (None, None):
@@ -327,7 +327,7 @@ def _sized(request: Request, arrays: dict[str, Array], used: list[Array]) -> Req
 
 
 def _one(request: Request, arrays: dict[str, Array], name: str) -> np.ndarray:
-    """Return the one number or text of an array."""
+    """Return the single number or text in an array."""
     array = arrays[name]
     if (
         int(np.prod(array.shape, dtype=object)) != 1
@@ -348,7 +348,7 @@ def _one(request: Request, arrays: dict[str, Array], name: str) -> np.ndarray:
 
 
 def _listing(arrays: dict[str, Array]) -> str:
-    """Return the arrays of a file in words."""
+    """Describe the arrays of a file in words."""
     shown = [f"{array.name} {array.dtype} {array.shape}" for array in list(arrays.values())[:12]]
     return f"it contains {', '.join(shown) or 'no arrays'}"
 
@@ -357,8 +357,9 @@ def _listing(arrays: dict[str, Array]) -> str:
 def npz_writer(path: Path, width: int, height: int, is_labelled: bool) -> Iterator[Append]:
     """Yield a function that adds events to an npz file, compressed: t (int64 us), x, y (uint16), p (0, 1).
 
-    A column must be whole before the next begins, so columns wait in files beside it. The sensor's size,
-    and the unit of the times in two ways, are there as EventCV and this project have them.
+    A zip file stores one column after the other, so the columns are first written to temporary files in the
+    same folder. The file also contains the sensor's size and the unit of the times, the latter in the forms
+    of both EventCV and this project.
     """
     types: dict[str, np.dtype] = WRITTEN | ({NOISE: np.dtype(bool)} if is_labelled else {})
     count = 0

@@ -1,6 +1,6 @@
-"""Find the members of a zip file that was cut off, and so lost the table of its members.
+"""Find the members of a truncated zip file, which has lost its table of members.
 
-Each member has a header in front of it, which suffices to read it up to where the file ends.
+A header precedes each member, which suffices to read the member up to the end of the file.
 """
 
 import io
@@ -14,7 +14,7 @@ from typing import IO
 HEADER = struct.Struct("<4s5H3I2H")
 MAGIC = b"PK\x03\x04"
 STORED, DEFLATED = 0, 8
-LARGE = 0xFFFFFFFF  # the sizes are in the extra field
+LARGE = 0xFFFFFFFF  # this size means that the extra field contains the size
 LARGE_FIELD = 1
 MAX_MEMBERS = 1000
 CHUNK_BYTES = 1 << 16
@@ -60,16 +60,16 @@ def _open(path: Path, start: int, size: int, method: int) -> IO[bytes]:
 
 
 class _Member(io.RawIOBase):
-    """The bytes of a member, unpacked, up to where its packed bytes end or are damaged."""
+    """The unpacked bytes of a member, up to the end of its packed bytes or the first damage."""
 
     def __init__(self, path: Path, start: int, size: int, method: int) -> None:
-        """Begin at its first byte."""
+        """Open the file at the member's first byte."""
         self._file, self._left = path.open("rb"), size
         self._file.seek(start)
         self._unpack = zlib.decompressobj(-zlib.MAX_WBITS) if method == DEFLATED else None
 
     def readable(self) -> bool:
-        """Return that it can be read."""
+        """Return True."""
         return True
 
     def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
@@ -79,7 +79,7 @@ class _Member(io.RawIOBase):
         return len(data)
 
     def _next(self, most: int) -> bytes:
-        """Return some bytes."""
+        """Return up to `most` unpacked bytes; none at the end."""
         if self._unpack is None:
             return self._packed(most)
         while not self._unpack.eof:

@@ -1,7 +1,7 @@
-"""Put the events of a file in the order of time, by rules that are the same for every format.
+"""Sort the events of a file by time, by the same rules for every format.
 
 Real files contain a little disorder and some damage. Late events are sorted in. An event outside the
-sensor, of an older clock, or with a time far from all others is left out and counted. Gaps are told.
+sensor, of an older clock, or with a time far from all others is left out and counted. Gaps are reported.
 """
 
 import dataclasses
@@ -26,10 +26,10 @@ from envs.recordings.event_file import (
     concatenated,
 )
 
-FAR_US = 1_000_000  # a longer step is a gap, or a clock that was set
-TORN_US = 990_000  # an event as late as this has a second that was not carried (jAER drops them too)
-FEW_STRAYS = 100  # events in a row whose times may be damaged
-FEW_OLD = 10_000  # events that a camera may send with the clock of before a reset
+FAR_US = 1_000_000  # a longer step is a gap or a reset of the clock
+TORN_US = 990_000  # an event as late as this lacks the carry into the seconds (jAER drops such events too)
+FEW_STRAYS = 100  # maximum number of successive events with damaged times
+FEW_OLD = 10_000  # maximum number of events that a camera sends on its old clock after a reset
 MOST_RESETS = 16
 
 GOOD, IS_OUTSIDE, IS_TORN, IS_LEFT_OUT = range(4)  # marks of events
@@ -37,14 +37,14 @@ GOOD, IS_OUTSIDE, IS_TORN, IS_LEFT_OUT = range(4)  # marks of events
 
 @dataclasses.dataclass
 class Clock:
-    """Follow the time from part to part.
+    """State of the time that carries over from part to part.
 
     Attributes:
-        newest_us: Newest time that was taken [us]; -1: none.
-        shift_us: Added to the times of the file after a reset [us].
-        taken: Number of events that were taken.
-        seen: Number of events of the file.
-        delivered_us: Newest time that was handed on [us]; -1: none.
+        newest_us: Newest time of accepted events [us]; -1: none.
+        shift_us: Offset of the times of the file after a reset [us].
+        taken: Number of accepted events.
+        seen: Number of events of the file so far.
+        delivered_us: Newest time of yielded events [us]; -1: none.
     """
 
     newest_us: int = -1
@@ -55,16 +55,16 @@ class Clock:
 
 
 def in_order(opened: Opened, hold: int | None) -> Iterator[Part]:
-    """Yield the events of a file in the order of time.
+    """Yield the events of a file in order of time.
 
     Args:
         opened: The file.
-        hold: The newest second of events is held back until later events are known, but at most so many
-            events; None: the whole file is one part.
+        hold: Maximum number of events held back until later events are known; they are the newest second of
+            events. None: the whole file is one part.
 
     Raises:
-        ValueError: More than a tenth of the events are outside the sensor, the clock goes back often, or
-            the request is strict and the file is damaged.
+        ValueError: More than a tenth of the events are outside the sensor, the clock goes back more than 16
+            times, or the request is strict and the file is damaged.
     """
     request, clock, held = opened.request, Clock(), Part(np.empty(0, EVENT))
     for part in opened.parts if hold is not None else (joined(opened.parts, request),):
@@ -83,10 +83,10 @@ def in_order(opened: Opened, hold: int | None) -> Iterator[Part]:
 
 
 def joined(parts: Iterator[Part], request: Request) -> Part:
-    """Return all parts as one.
+    """Join all parts into one.
 
     Raises:
-        ValueError: They have more than `max_events` events.
+        ValueError: The parts have more than `max_events` events.
     """
     some: list[Part] = []
     count = 0
@@ -97,10 +97,10 @@ def joined(parts: Iterator[Part], request: Request) -> Part:
 
 
 def check_strict(request: Request) -> None:
-    """Refuse a damaged file if the request is strict.
+    """Raise an error for a damaged file if the request is strict.
 
     Raises:
-        ValueError: The tally counts damage.
+        ValueError: The request is strict and the tally counts damage.
     """
     if request.strict and (request.tally.damage or request.tally.strays):
         raise request.refusal(
@@ -119,13 +119,13 @@ def damage_lines(damage: Mapping[str, int], strays: int) -> list[str]:
 def walk(
     events: np.ndarray, width: int, height: int, newest: int, marks: np.ndarray, breaks: np.ndarray
 ) -> tuple[int, int, int]:
-    """Mark events outside the sensor and torn ones, and find where time makes a long step.
+    """Mark events that are outside the sensor or torn, and find long steps of the time.
 
     Args:
         events: EVENT array (N,) in the order of the file.
         width: Columns of the sensor [px].
-        height: Its rows [px].
-        newest: The newest time before them [us]; -1: none.
+        height: Rows of the sensor [px].
+        newest: Newest time before these events [us]; -1: none.
         marks: uint8 (N,), filled with marks.
         breaks: int64 (N,), filled with the first event after each step of more than a second.
 
@@ -157,7 +157,7 @@ def walk(
 
 @numba.njit(cache=True, error_model="numpy")
 def count_late(events: np.ndarray, newest: int) -> tuple[int, int]:
-    """Return how many events are older than one before them, and the newest time [us]."""
+    """Return the number of events that are older than an earlier one, and the newest time [us]."""
     late = 0
     for i in range(events.size):
         t = events[i].t
@@ -167,7 +167,7 @@ def count_late(events: np.ndarray, newest: int) -> tuple[int, int]:
 
 
 def _taken(part: Part, request: Request, clock: Clock) -> tuple[Part, bool]:
-    """Return the good events of a part, and whether all events before them are of an older clock."""
+    """Return the good events of a part, and whether all events before the part are of an older clock."""
     events = part.events
     marks, breaks = np.empty(len(events), np.uint8), np.empty(len(events), np.int64)
     size = request.width or 65536, request.height or 65536
@@ -193,7 +193,7 @@ def _taken(part: Part, request: Request, clock: Clock) -> tuple[Part, bool]:
 
 
 def _count_outside(request: Request, clock: Clock, events: np.ndarray, outside: int) -> None:
-    """Count events outside the sensor, and refuse the file if they are many."""
+    """Count events outside the sensor; raise ValueError if there are too many."""
     if not outside:
         return
     beyond = request.tally.damage[OUTSIDE] = request.tally.damage[OUTSIDE] + outside
@@ -207,11 +207,12 @@ def _count_outside(request: Request, clock: Clock, events: np.ndarray, outside: 
 def _without_jumps(
     request: Request, events: np.ndarray, marks: np.ndarray, breaks: np.ndarray, clock: Clock
 ) -> tuple[np.ndarray, bool]:
-    """Decide what each long step of the time is: a gap, stray times, an older clock or a reset.
+    """Classify each long step of the time as a gap, stray times, an older clock or a reset.
+
+    Marks the events to leave out in `marks`.
 
     Returns:
-        The events, on one clock, with marks where they are left out; and whether everything before
-        the part is of an older clock.
+        The events on one clock, and whether all events before the part are of an older clock.
     """
     events, is_old = events.copy(), False
     bounds = [0, *breaks.tolist(), len(events)]
@@ -248,13 +249,13 @@ def _without_jumps(
 
 
 def _is_old(marks: np.ndarray, clock: Clock, size: int) -> bool:
-    """Whether the few events before a run are left over from an older clock."""
+    """Whether the events before a run are few enough to be leftovers of an older clock."""
     before = clock.taken + int(np.count_nonzero(marks == GOOD))
     return clock.delivered_us < 0 and before <= min(FEW_OLD, size // 10)
 
 
 def _merged(held: Part, part: Part, request: Request, clock: Clock) -> Part:
-    """Return the events that were held back and those of a part, sorted; ties keep their order."""
+    """Sort the events that were held back together with the events of a part; ties keep their order."""
     if len(held.events):
         part = concatenated((held, part))
     t_us = part.events["t"]
@@ -268,7 +269,7 @@ def _merged(held: Part, part: Part, request: Request, clock: Clock) -> Part:
 
 
 def _delivered(part: Part, clock: Clock) -> Part:
-    """Return a part that is handed on."""
+    """Record the newest time of a part that is about to be yielded; return the part."""
     if len(part.events):
         clock.delivered_us = int(part.events["t"][-1])
     return part

@@ -1,7 +1,7 @@
 """Read files of Prophesee cameras, DAT and RAW with EVT 2.0, EVT 2.1 and EVT 3.0; write all but EVT 2.1.
 
-Both begin with lines `% name value`, and the names tell them apart. From the published descriptions
-(docs.prophesee.ai: "DAT File Format", "EVT 2.0 Format", "EVT 2.1 Format", "EVT 3.0 Format").
+DAT and RAW both start with lines `% name value`; the names distinguish them. Source: docs.prophesee.ai, "DAT
+File Format", "EVT 2.0 Format", "EVT 2.1 Format", "EVT 3.0 Format".
 """
 
 import contextlib
@@ -31,16 +31,16 @@ from envs.recordings.mapped import mapped, mapped_parts
 MAX_HEADER_BYTES = 1 << 16
 DAT_WORD = np.dtype([("t", "<u4"), ("data", "<u4")])
 DAT_CD_TYPES = (0x00, 0x0C)  # Event2d, EventCD
-FEW_RESERVED = 16  # words of types that do not exist; more than an eighth of all words is another encoding
-MAX_TRIGGERS = 1 << 16  # of a part
+FEW_RESERVED = 16  # words of unknown types that are always allowed; above it, at most an eighth of all words
+MAX_TRIGGERS = 1 << 16  # limit of a part
 NAMES = {"EVT2": "evt2", "2.0": "evt2", "EVT21": "evt21", "2.1": "evt21", "EVT3": "evt3", "3.0": "evt3"}
 
-# Words of the encodings.
+# Type of the words of each encoding.
 WORDS: dict[str, np.dtype] = {"evt2": np.dtype("<u4"), "evt21": np.dtype("<u8"), "evt3": np.dtype("<u2")}
-# Clock bits and coordinate bits, and so the first time that does not fit.
+# Bits of the clock and of a coordinate.
 LIMITS = {"dat": (32, 14), "evt2": (34, 11), "evt3": (24, 11)}
-MAX_WORDS = 1 << 26  # of a part: a gap of 76 hours in EVT 3.0
-# Sensors by the name of the camera plug-in, for files that state no geometry.
+MAX_WORDS = 1 << 26  # limit of a part: a gap of 76 hours in EVT 3.0
+# Name of the camera plug-in and sensor size, for files that state no geometry.
 SENSORS = (("genx320", 320, 320), ("imx636", 1280, 720), ("gen4", 1280, 720), ("gen3", 640, 480))
 
 
@@ -48,7 +48,7 @@ def read_dat(request: Request) -> Opened:
     """Open a DAT file, version 2. The 32-bit clock of 71.6 minutes is unwrapped.
 
     Raises:
-        ValueError: Another version or event type.
+        ValueError: The file has another version or event type.
     """
     fields, start = _header(request)
     if fields.get("Version") != "2":
@@ -75,13 +75,13 @@ def _dat_parts(request: Request, start: int, count: int) -> Iterator[Part]:
 
 
 def read_evt(request: Request, format: str | None = None) -> Opened:
-    """Open a RAW file of EVT 2.0, 2.1 or 3.0, as its header says, else as the caller says.
+    """Open a RAW file of EVT 2.0, 2.1 or 3.0, as stated in its header or else by the caller.
 
-    Triggers are read; padding is passed over and counted. A header with a version and without an
-    encoding is that of a DAT file, in whatever order its lines are.
+    Triggers are read; padding is skipped and counted. A header with a version and without an encoding
+    belongs to a DAT file, in whatever order its lines are.
 
     Raises:
-        ValueError: No known encoding, or words that the encoding does not have.
+        ValueError: The encoding is unknown, or words have types that the encoding does not have.
     """
     fields, start = _header(request)
     if format is None and "Version" in fields and not fields.keys() & {"evt", "format"}:
@@ -115,13 +115,13 @@ def evt_parts(
         words: uint16, uint32 or uint64.
         endianness: "legacy": the lower half of a word of EVT 2.1 comes second.
         forget: Called with the number of words that have been decoded.
-        states: State by encoding, of the words before these; it is moved on. None: nothing was before.
+        states: Encoding -> decoder state after the previous words; updated in place. None: no previous words.
     """
     states = {} if states is None else states
     state = states.setdefault(encoding, new_state())
     state[State.WORD], before = 0, state.copy()
     decode = decoder(encoding, words, endianness)
-    # About as many as such words usually encode; denser ones take several arrays.
+    # About the number of events that such words usually encode; denser words take several arrays.
     usual = len(words) * {"evt2": 2, "evt21": 4, "evt3": 1}[encoding] // 2
     while state[State.WORD] < len(words):
         events = np.empty(min(request.part_events, usual) + 32, EVENT)
@@ -137,7 +137,7 @@ def decoder(
 ) -> Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[int, int]]:
     """Return a function of state, events and triggers that fills the last two from words of an encoding.
 
-    It returns how many there are of each, as the functions of `evt_decoders`.
+    The function returns the numbers of events and triggers, like the functions of `evt_decoders`.
     """
     if encoding == "evt3":
         return partial(decode_evt3, words)
@@ -149,10 +149,10 @@ def decoder(
 
 
 def _count(request: Request, state: np.ndarray, before: np.ndarray, events: int) -> None:
-    """Add to the tally what a decoder counted since `before`, and refuse words of another encoding.
+    """Add a decoder's counts since `before` to the tally, and check that the encoding is right.
 
     Raises:
-        ValueError: More than an eighth of the words are of types that the encoding does not have, or more
+        ValueError: More than an eighth of the words have types that the encoding does not have, or more
             events lie beyond its last column than within it.
     """
     new = state - before
@@ -175,7 +175,7 @@ def _count(request: Request, state: np.ndarray, before: np.ndarray, events: int)
 
 
 def _header(request: Request) -> tuple[dict[str, str], int]:
-    """Return the fields of the text lines at the beginning, and the place of the first word."""
+    """Return the fields of the text lines at the start, and the position of the first word."""
     head = np.fromfile(request.path, np.uint8, MAX_HEADER_BYTES).tobytes()
     fields: dict[str, str] = {}
     start = 0
@@ -195,7 +195,7 @@ def _header(request: Request) -> tuple[dict[str, str], int]:
 
 
 def _encoding(request: Request, fields: dict[str, str], format: str | None) -> str:
-    """Return the encoding by the header, else by the caller."""
+    """Return the encoding that the header states, else the caller's."""
     said = fields.get("format", fields.get("evt", "")).partition(";")[0]
     encoding = NAMES.get(said)
     if said and encoding is None:
@@ -210,7 +210,7 @@ def _encoding(request: Request, fields: dict[str, str], format: str | None) -> s
 
 
 def _geometry(fields: dict[str, str], options: dict[str, str]) -> tuple[int | None, int | None]:
-    """Return width and height of the sensor as far as the header knows them."""
+    """Return width and height of the sensor from the header; None if it does not state them."""
     if "width" in options and "height" in options:
         return _number(options["width"]), _number(options["height"])
     width, _, height = fields.get("geometry", "").partition("x")
@@ -229,19 +229,19 @@ def dat_writer(path: Path, width: int, height: int) -> AbstractContextManager[Ap
     """Yield a function that adds events to a DAT file.
 
     Raises:
-        ValueError: The format's clock or address cannot represent them.
+        ValueError: The format's clock or address cannot represent the events.
     """
     lines = f"% Data file containing CD events\n% Version 2\n% Width {width}\n% Height {height}\n"
     return _writer(path, width, height, "dat", lines.encode() + bytes((0x0C, 8)), _dat_words)
 
 
 def evt2_writer(path: Path, width: int, height: int) -> AbstractContextManager[Append]:
-    """Yield a function that adds events to a RAW file of EVT 2.0; raises as `dat_writer`."""
+    """Yield a function that adds events to a RAW file of EVT 2.0; raises as in `dat_writer`."""
     return _writer(path, width, height, "evt2", _evt_header("2.0", width, height), _Evt2())
 
 
 def evt3_writer(path: Path, width: int, height: int) -> AbstractContextManager[Append]:
-    """Yield a function that adds events to a RAW file of EVT 3.0; raises as `dat_writer`."""
+    """Yield a function that adds events to a RAW file of EVT 3.0; raises as in `dat_writer`."""
     return _writer(path, width, height, "evt3", _evt_header("3.0", width, height), _Evt3(path))
 
 
@@ -254,7 +254,7 @@ def _writer(
     header: bytes,
     words: Callable[[np.ndarray], np.ndarray],
 ) -> Iterator[Append]:
-    """Yield a function that adds the words of events behind a header."""
+    """Write a header and yield a function that appends the words of events."""
     clock_bits, address_bits = LIMITS[format]
     if max(width, height) > 1 << address_bits:
         raise ValueError(f"{format} addresses at most {1 << address_bits} pixels, got {width}x{height}")
@@ -273,7 +273,7 @@ def _writer(
 
 
 def _check_clock(events: np.ndarray, format: str, bits: int, is_first: bool) -> None:
-    """Refuse times that the clock cannot represent: EVT 3.0 counts its turns, but has none for the first."""
+    """Raise ValueError for times that the clock cannot represent. EVT 3.0 may wrap after its first event."""
     which = "first" if format == "evt3" else "last"
     if not len(events) or (which == "first" and not is_first):
         return
@@ -293,7 +293,7 @@ def _evt_header(version: str, width: int, height: int) -> bytes:
 
 
 def _dat_words(events: np.ndarray) -> np.ndarray:
-    """Return entries of DAT."""
+    """Return events as DAT entries."""
     words = np.empty(len(events), DAT_WORD)
     words["t"] = events["t"]
     words["data"] = (
@@ -303,7 +303,7 @@ def _dat_words(events: np.ndarray) -> np.ndarray:
 
 
 class _Evt2:
-    """Words of EVT 2.0: a high part of the time wherever it changes, then the event."""
+    """Encode EVT 2.0: a word with the high part of the time whenever it changes, then the event."""
 
     def __init__(self) -> None:
         self._high = -1
@@ -321,7 +321,7 @@ class _Evt2:
 
 
 class _Evt3:
-    """Words of EVT 3.0 without vectors, with every high part of the time, as a camera sends them."""
+    """Encode EVT 3.0 without vectors, with every high part of the time, as a camera sends them."""
 
     def __init__(self, path: Path) -> None:
         self._path, self._high, self._low, self._y = path, -1, -1, -1
@@ -333,7 +333,7 @@ class _Evt3:
         steps = np.diff(high, prepend=before)
         new_low = (steps > 0) | (np.diff(low, prepend=self._low) != 0)
         new_y = np.diff(y, prepend=self._y) != 0
-        last = np.cumsum(steps + new_low + new_y + 1) - 1  # where the word with x of each event goes
+        last = np.cumsum(steps + new_low + new_y + 1) - 1  # index of the word with x of each event
         if last[-1] >= MAX_WORDS:
             raise ValueError(
                 f"{self._path}: evt3 needs {last[-1] + 1} words for gaps this long; choose npz or hdf5"

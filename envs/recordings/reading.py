@@ -1,4 +1,4 @@
-"""Read events of any format: a whole file, a range of its times, or part by part."""
+"""Read events of any format: a whole file, a range of times, or part by part."""
 
 import copy
 import itertools
@@ -26,10 +26,10 @@ from envs.recordings.names import US_PER
 from envs.recordings.order import damage_lines, in_order, joined
 from envs.recordings.ros_storage import is_bag_folder
 
-MOST_GAPS = 3  # that a warning names
+MOST_GAPS = 3  # gaps that a warning lists
 
 
-def read_events(  # noqa: PLR0913  each is something else that a file may not say
+def read_events(  # noqa: PLR0913  files may lack any of this
     path: str | Path,
     format: str | None = None,
     *,
@@ -48,33 +48,33 @@ def read_events(  # noqa: PLR0913  each is something else that a file may not sa
 ) -> EventFile:
     """Read an event file of any known format.
 
-    Damage is left out and counted in `damage`; one warning tells of it, and of gaps.
+    Damaged data is left out and counted in `damage`. One warning reports damage and gaps.
 
     Args:
         path: A regular file, or the folder of a rosbag2.
-        format: One of `FORMATS`; None: by how the file begins, else by its suffix.
-        width: Columns of the sensor [px], where the file does not say.
-        height: Its rows [px].
+        format: One of `FORMATS`; None: recognised by its first bytes, else by its suffix.
+        width: Columns of the sensor [px], if the file does not state them.
+        height: Rows of the sensor [px], if the file does not state them.
         columns: Text, and rows without names: all columns in their order, such as ("t", "x", "y", "p");
-            others than these four are passed over. npz and HDF5: names of the arrays of t, x, y and p.
-        time_unit: "s", "ms", "us" or "ns", for files that do not say.
+            columns with other names are ignored. npz and HDF5: names of the arrays of t, x, y and p.
+        time_unit: "s", "ms", "us" or "ns", if the file does not state it.
         topic: Topic of events in a ROS bag.
-        group: Group or data set of an HDF5 file, or array of an npz file, that has the events.
+        group: Group or data set of an HDF5 file, or array of an npz file, that contains the events.
         stream: Number of a stream or source of an AEDAT file.
-        start_us: First time that is read [us], on the clock of the file.
+        start_us: First time to read [us], on the clock of the file.
         end_us: Time before which reading ends [us].
-        strict: Whether damage is refused.
-        max_events: Most events that are read; each takes 13 bytes in the end and up to 80 on the way
-            (a camera's own format: 50). None: two for each byte of the file, but ten million
-            of any file and at most a hundred million.
-        max_bytes: Largest file that is opened [bytes].
+        strict: Whether damage is an error.
+        max_events: Maximum number of events. Each takes 13 bytes in the result and up to 80 while
+            reading (50 for a camera's own format). None: two for each byte of the file, but at least
+            ten million and at most a hundred million.
+        max_bytes: Maximum size of the file [bytes].
 
     Returns:
         The events sorted by t (ties keep the order of the file), p in {-1, +1}, with the sensor's size.
 
     Raises:
-        ValueError: The file is no regular file, of no known format, too large, damaged beyond what is
-            tolerated, or breaks a rule of its format; the message names the file, the rule and the remedy.
+        ValueError: The file is no regular file, has no known format, is too large, is too damaged, or
+            breaks a rule of its format; the message names the file, the rule and the remedy.
     """
     opened = _opened(**locals())
     request = opened.request
@@ -110,33 +110,32 @@ def read_parts(  # noqa: PLR0913  as above
     part_events: int = PART_EVENTS,
     max_bytes: int = MAX_BYTES,
 ) -> Iterator[EventFile]:
-    """Yield the events of a file in parts, in order, in memory that is bounded by the part.
+    """Yield the events of a file in parts, in order of time, with memory for about one part.
 
-    Events that are late by less than a second are sorted in, if the second has no more events than a part;
-    events that are too late are counted in `damage`.
+    Events that are late by less than a second are sorted in, if that second has no more events than a part;
+    events that are later are counted in `damage`.
 
     Args:
-        path: As in `read_events`, and so are the other arguments.
-        format: As there.
-        width: As there.
-        height: As there.
-        columns: As there.
-        time_unit: As there.
-        topic: As there.
-        group: As there.
-        stream: As there.
-        start_us: As there.
-        end_us: As there.
-        strict: As there.
-        part_events: Most events of a part, about.
-        max_bytes: As there.
+        path: As in `read_events`.
+        format: As in `read_events`.
+        width: As in `read_events`.
+        height: As in `read_events`.
+        columns: As in `read_events`.
+        time_unit: As in `read_events`.
+        topic: As in `read_events`.
+        group: As in `read_events`.
+        stream: As in `read_events`.
+        start_us: As in `read_events`.
+        end_us: As in `read_events`.
+        strict: As in `read_events`.
+        part_events: Approximate maximum number of events of a part.
+        max_bytes: As in `read_events`.
 
     Yields:
-        Parts, each with the counts of what was found since the part before it. A file without events gives
-        one part without events.
+        Parts, each with the counts since the previous part. A file without events gives one empty part.
 
     Raises:
-        ValueError: As `read_events`.
+        ValueError: As in `read_events`.
     """
     if part_events < 1:
         raise ValueError(f"part_events must be at least 1, got {part_events}")
@@ -144,7 +143,7 @@ def read_parts(  # noqa: PLR0913  as above
 
 
 def _parts(opened: Opened) -> Iterator[EventFile]:
-    """Yield parts as files."""
+    """Yield parts as `EventFile`s."""
     is_first, tally = True, Tally()
     ordered = in_order(opened, opened.request.part_events)
     empty = None
@@ -195,7 +194,7 @@ def _opened(
 
 
 def _within(parts: Iterator[Part], request: Request) -> Iterator[Part]:
-    """Yield what lies in the range of times of a request, and stop after it."""
+    """Yield the events and triggers within the request's range of times, and stop after it."""
     start = np.iinfo(np.int64).min if request.start_us is None else request.start_us
     end = np.iinfo(np.int64).max if request.end_us is None else request.end_us
     for part in parts:
@@ -209,7 +208,7 @@ def _within(parts: Iterator[Part], request: Request) -> Iterator[Part]:
 
 
 def _file(opened: Opened, part: Part, before: Tally) -> EventFile:
-    """Return a part with the counts since another tally."""
+    """Return a part as an `EventFile`, with the counts since the tally `before`."""
     request, tally = opened.request, opened.request.tally
     return EventFile(
         part.events,
@@ -228,7 +227,7 @@ def _file(opened: Opened, part: Part, before: Tally) -> EventFile:
 
 
 def tell(path: Path, file: EventFile) -> None:
-    """Warn once of what a reader left out, chose, or found missing."""
+    """Issue one warning about a reader's choices, damage and gaps, if any."""
     lines = list(file.notes)
     lost = damage_lines(file.damage, file.strays)
     if lost:

@@ -1,6 +1,6 @@
-"""Read events of ROS bags: dvs_msgs, prophesee_event_msgs and event_camera_msgs.
+"""Read events from ROS bags: dvs_msgs, prophesee_event_msgs and event_camera_msgs.
 
-Messages are decoded from their bytes: an object for each event would take a hundred times as long.
+Messages are decoded directly from bytes: an object for each event would take a hundred times as long.
 """
 
 import struct
@@ -12,28 +12,28 @@ from envs.recordings.event_file import CUT, CUT_PACKETS, Opened, Part, Request
 from envs.recordings.event_packets import EventArray, EventPacket, PacketDecoder
 from envs.recordings.ros_storage import Bag, Message, Topic, messages, open_bags
 
-# Types of messages with events, and with arrays of packed bytes.
+# Types of messages with arrays of events, and with packed bytes.
 ARRAYS = ("dvs_msgs/EventArray", "prophesee_event_msgs/EventArray")
 PACKETS = ("event_camera_msgs/EventPacket", "event_array_msgs/EventArray")
-MIN_BYTES = 2  # of an event, about
+MIN_BYTES = 2  # approximate size of an event
 # An event of ROS 1: x, y, seconds, nanoseconds, polarity, without gaps.
 EVENT_1 = np.dtype([("x", "<u2"), ("y", "<u2"), ("s", "<u4"), ("ns", "<u4"), ("p", "u1")])
 EVENT_2_BYTES = 16  # from one event of CDR to the next
 
 
 class Values:
-    """Numbers and texts of a message, one after the other.
+    """Read the numbers and texts of a message one after the other.
 
     A struct.error or ValueError means that the message ends too early.
     """
 
     def __init__(self, raw: bytes, is_ros1: bool) -> None:
-        """Begin with the first value; the four bytes before a message of CDR say its byte order."""
+        """Start at the first value; a CDR message has four bytes before it that state the byte order."""
         self.raw, self.is_ros1, self.place = raw, is_ros1, 0 if is_ros1 else 4
         self._order = "<" if is_ros1 or raw[1:2] in (b"\1", b"\3") else ">"
 
     def real(self, code: str) -> float:
-        """Return the next number by its code for `struct`; only in CDR there is a gap before it."""
+        """Return the next number by its code for `struct`; CDR aligns numbers, ROS 1 does not."""
         size = struct.calcsize("<" + code)
         if not self.is_ros1:
             self.place += (4 - self.place) % size
@@ -58,7 +58,7 @@ class Values:
         return self.raw[self.place - size : self.place]
 
     def header(self) -> int:
-        """Return the time [us] of a header: a number (ROS 1), a time and the name of a frame."""
+        """Read a header (ROS 1: a number; a time; the name of a frame) and return its time [us]."""
         if self.is_ros1:
             self.number("I")
         seconds, nanoseconds = self.number("I"), self.number("I")
@@ -69,10 +69,10 @@ class Values:
 def read_ros(request: Request) -> Opened:
     """Open a ROS 1 bag, or a rosbag2 as a folder or a .db3 or .mcap file.
 
-    Events come from the topic that `topic` names, else from the one topic of events with most messages.
+    Events come from the topic that `topic` names, else from the topic of events with most messages.
 
     Raises:
-        ValueError: The library rosbags is missing, or there is no such topic; the message lists them.
+        ValueError: The library rosbags is missing, or there is no such topic; the message lists all topics.
     """
     bags = open_bags(request)
     topics = list(dict.fromkeys(topic for bag in bags for topic in bag.topics))
@@ -91,7 +91,7 @@ def read_ros(request: Request) -> Opened:
 
 
 def _chosen(request: Request, topics: list[Topic]) -> Topic:
-    """Return the topic that is read."""
+    """Return the topic to read."""
     found = [topic for topic in topics if topic.kind in (*ARRAYS, *PACKETS)]
     if request.topic is not None:
         found = [topic for topic in found if topic.name == request.topic]
@@ -125,7 +125,7 @@ def _parts(request: Request, bags: list[Bag], topic: Topic) -> Iterator[Part]:
 
 
 def _decoded(bags: list[Bag], topic: Topic) -> Iterator[tuple[Message, EventArray | EventPacket | None]]:
-    """Yield the messages of a topic, and what each says; None: it is damaged."""
+    """Yield the messages of a topic, each with its decoded contents, or None if it is damaged."""
     for bag in bags:
         for message in messages(bag, {topic.name}):
             values = Values(message.raw, bag.is_ros1)
@@ -138,7 +138,7 @@ def _decoded(bags: list[Bag], topic: Topic) -> Iterator[tuple[Message, EventArra
 
 
 def event_array(values: Values) -> EventArray:
-    """Return the events of a message."""
+    """Decode a message that is an array of events."""
     values.header()
     height, width, count = values.number("I"), values.number("I"), values.number("I")
     if values.is_ros1:
@@ -151,10 +151,10 @@ def event_array(values: Values) -> EventArray:
 
 
 def event_packet(values: Values) -> EventPacket:
-    """Return a packet of bytes."""
+    """Decode a message that is a packet of bytes."""
     values.header()
     height, width = values.number("I"), values.number("I")
-    values.number("Q")  # which packet it is
+    values.number("Q")  # number of the packet
     base, encoding, is_big = values.number("Q"), values.text(), values.number("B")
     if is_big:
         raise ValueError("big-endian packets are not read")
@@ -162,9 +162,9 @@ def event_packet(values: Values) -> EventPacket:
 
 
 def _rows_2(values: Values, count: int) -> np.ndarray:
-    """Return the events of CDR as rows with the fields of `EVENT_1`.
+    """Return the events of a CDR message as rows with the fields of `EVENT_1`.
 
-    The gaps of CDR leave x and y of all events but the first two bytes further ahead.
+    Because of CDR's alignment, x and y of the first event lie two bytes earlier than in all others.
     """
     if not count:
         return np.empty(0, EVENT_1)

@@ -1,9 +1,9 @@
-"""Read the messages of ROS bags: ROS 1, and rosbag2 in db3 or mcap; also of bags that were cut off.
+"""Read the messages of ROS bags: ROS 1, and rosbag2 in db3 or mcap; also of truncated bags.
 
-Whole bags are read with the library rosbags (the extra `ros`). It reads no bag without its index, as a
-crashed recorder leaves it; such a bag is walked record by record, by the descriptions of the bag format 2.0
-(wiki.ros.org/Bags/Format/2.0) and of MCAP (mcap.dev/spec). What is whole is read; the walk ends where the
-file does. It needs lz4 and zstd, which come with rosbags.
+Complete bags are read with the library rosbags (the extra `ros`). It cannot read a bag without an index, such
+as a crashed recorder leaves. Such a bag is read record by record up to its end, by the descriptions of the
+bag format 2.0 (wiki.ros.org/Bags/Format/2.0) and of MCAP (mcap.dev/spec). This needs lz4 and zstd, which come
+with rosbags.
 """
 
 import bz2
@@ -21,14 +21,14 @@ from envs.recordings.event_file import Request
 MAGIC_BAG, MAGIC_DB3, MAGIC_MCAP = b"#ROSBAG V2.0", b"SQLite format 3\0", b"\x89MCAP0\r\n"
 STORAGE = (".db3", ".mcap")
 MAX_RECORD = 1 << 31
-BROKEN = (struct.error, sqlite3.Error, KeyError, EOFError, UnicodeDecodeError, OSError)  # of a walk
+BROKEN = (struct.error, sqlite3.Error, KeyError, EOFError, UnicodeDecodeError, OSError)  # ends of a walk
 
 
 class Topic(NamedTuple):
     """A topic of a bag.
 
     Attributes:
-        name: Such as "/dvs/events".
+        name: Name, such as "/dvs/events".
         kind: Type of its messages, package/Name.
         number: Number of messages; -1: not known.
     """
@@ -42,9 +42,9 @@ class Message(NamedTuple):
     """A message of a bag.
 
     Attributes:
-        topic: Its topic.
+        topic: Name of its topic.
         kind: Its type.
-        raw: As it is serialized.
+        raw: The serialized message.
     """
 
     topic: str
@@ -56,10 +56,10 @@ class Bag(NamedTuple):
     """A bag that is ready to be read.
 
     Attributes:
-        path: A file, or the folder of a whole rosbag2.
+        path: A file, or the folder of a complete rosbag2.
         topics: Its topics.
         is_whole: Whether it has its index.
-        is_ros1: Whether messages are serialized as by ROS 1.
+        is_ros1: Whether messages are serialized as in ROS 1.
     """
 
     path: Path
@@ -76,10 +76,10 @@ def is_bag_folder(path: Path) -> bool:
 
 
 def open_bags(request: Request) -> list[Bag]:
-    """Return the bag of a path: one, or the files of a folder without its metadata.
+    """Return the bags of a path: one, or one for each file of a folder without metadata.
 
     Raises:
-        ValueError: The library rosbags is missing, or there is no file in the folder.
+        ValueError: The library rosbags is missing, the path is no ROS bag, or the folder has no files of one.
     """
     path = request.path
     try:
@@ -99,7 +99,7 @@ def open_bags(request: Request) -> list[Bag]:
 
 
 def messages(bag: Bag, topics: set[str]) -> Iterator[Message]:
-    """Yield the whole messages of some topics, in the order of their recording."""
+    """Yield the complete messages of some topics, in the order of their recording."""
     if not bag.is_whole:
         for item in _walk(bag.path):
             if isinstance(item, Message) and item.topic in topics:
@@ -113,13 +113,13 @@ def messages(bag: Bag, topics: set[str]) -> Iterator[Message]:
 
 
 def _whole(path: Path) -> Bag | None:
-    """Return a bag as the library opens it, or None if it does not."""
+    """Return a bag that the library can open, or None if it cannot."""
     try:
         with _reader(path) as reader:
             counts = Counter[tuple[str, str]]()
             for one in reader.connections:
                 counts[one.topic, _kind(one.msgtype)] += one.msgcount
-    except Exception:  # the library's errors have no common base, and the walk judges again
+    except Exception:  # the library's errors have no common base; `_cut` then tries the file
         return None
     topics = [Topic(name, kind, count) for (name, kind), count in counts.items()]
     return Bag(path, topics, True, _is_ros1(path))
@@ -151,12 +151,12 @@ def _magic(path: Path) -> bytes:
 
 
 def _kind(name: str) -> str:
-    """Return a type of messages as ROS 1 and 2 both have it: package/Name."""
+    """Return a type of messages in the form common to ROS 1 and 2: package/Name."""
     return name.replace("/msg/", "/")
 
 
 def _walk(path: Path) -> Iterator[Topic | Message]:
-    """Yield topics and messages in the order of the file, until it ends or makes no sense."""
+    """Yield topics and messages in the order of the file, up to its end or the first invalid record."""
     magic, size = _magic(path), path.stat().st_size
     with contextlib.suppress(*BROKEN), path.open("rb") as file:
         if magic.startswith(MAGIC_BAG):
@@ -174,7 +174,7 @@ def _walk_bag(
 ) -> Iterator[Topic | Message]:
     """Walk through the records of a bag of ROS 1, or of one of its chunks.
 
-    At most `most` bytes are read at once: memory for a damaged size would be taken before.
+    At most `most` bytes are read at once, because a damaged size could otherwise allocate too much memory.
     """
     while len(size := file.read(4)) == 4:
         (length,) = struct.unpack("<I", size)
@@ -196,7 +196,7 @@ def _walk_bag(
 def _bag_record(
     header: dict[bytes, bytes], data: bytes, known: dict[bytes, Topic]
 ) -> Iterator[Topic | Message]:
-    """Yield what a record of a connection or a message says."""
+    """Yield the topic of a connection record, or the message of a message record."""
     if header.get(b"op") == b"\x07":
         facts = _split(data)
         known[header[b"conn"]] = Topic(header[b"topic"].decode(), facts[b"type"].decode(), -1)
@@ -207,7 +207,7 @@ def _bag_record(
 
 
 def _split(head: bytes) -> dict[bytes, bytes]:
-    """Return the fields of a header: their length, then name=value."""
+    """Return the fields of a header, each stored as its length and name=value."""
     fields, place = {}, 0
     while place < len(head):
         (size,) = struct.unpack_from("<I", head, place)
@@ -237,7 +237,7 @@ def _walk_mcap(
 def _mcap_record(
     code: int, data: bytes, known: dict[int, Topic], kinds: dict[int, str]
 ) -> Iterator[Topic | Message]:
-    """Yield what a record of a schema, a channel or a message says."""
+    """Yield the topic of a channel record or the message of a message record; store schemas in `kinds`."""
     if code == 3:
         (number,) = struct.unpack_from("<H", data)
         kinds[number] = _kind(_text(data, 2)[0])
@@ -252,7 +252,7 @@ def _mcap_record(
 
 
 def _text(data: bytes, place: int) -> tuple[str, int]:
-    """Return a text after its length, and the place behind it."""
+    """Return a text that follows its length, and the position after it."""
     (size,) = struct.unpack_from("<I", data, place)
     return data[place + 4 : place + 4 + size].decode(), place + 4 + size
 
@@ -269,7 +269,7 @@ def _walk_db3(path: Path) -> Iterator[Topic | Message]:
 
 
 def _unpacked(data: bytes, compression: str) -> bytes:
-    """Return what can be unpacked of a chunk."""
+    """Return the part of a chunk that can be unpacked."""
     if compression in ("", "none"):
         return data
     unpack: Any

@@ -1,4 +1,4 @@
-"""Read and write text and CSV files of events, one event a line."""
+"""Read and write text and CSV files of events, one event per line."""
 
 import contextlib
 import io
@@ -15,7 +15,7 @@ from core.files import replaced
 from envs.recordings.event_file import CUT_LINE, Append, Opened, Part, Request, assemble, chunks
 from envs.recordings.names import COLUMNS, microseconds, roles
 
-E2VID = {"columns": "t x y p", "usual_unit": "s"}  # after a first line with the sensor's size
+E2VID = {"columns": "t x y p", "usual_unit": "s"}  # for files whose first line is the sensor's size
 MAX_LINE_BYTES = 1000
 MAX_HEADER_LINES = 1000
 CHUNK_BYTES = 1 << 20
@@ -26,13 +26,13 @@ TRUTH = {"true": "1", "false": "0"}
 
 
 class Table(NamedTuple):
-    """How a text file lays out its events.
+    """Layout of the events in a text file.
 
     Attributes:
-        facts: What comment lines say: columns, time_unit, width, height.
+        facts: Values from comment lines: columns, time_unit, width, height.
         names: Names of the columns in the first line that is no comment, if there are any.
-        skip: Lines before the first event.
-        separator: Of columns; None: spaces.
+        skip: Number of lines before the first event.
+        separator: Separator of columns; None: spaces.
         has_words: Whether truth values are written as words.
     """
 
@@ -46,15 +46,15 @@ class Table(NamedTuple):
 def read_text(request: Request, open_bytes: Callable[[], IO[bytes]] | None = None) -> Opened:
     """Open a text or CSV file.
 
-    Lines that begin with `#` or `%` may say `columns`, `time_unit`, `width` and `height`, or name the
-    columns; or the first line names them, the time with its unit, such as `t_us,x,y,p` or
-    `timestamp[s] x y polarity`. What the file does not say the caller must. Columns are separated by
-    commas, semicolons, tabs or spaces. Further columns are passed over. A first line of two numbers is
-    E2VID's: width and height, before `t x y p` in seconds.
+    Lines that start with `#` or `%` may state `columns`, `time_unit`, `width` and `height`, or name the
+    columns; or the first line names the columns, the time with its unit, such as `t_us,x,y,p` or
+    `timestamp[s] x y polarity`. The caller must supply anything that the file does not state. Columns are
+    separated by commas, semicolons, tabs or spaces. Other columns are ignored. A first line of two numbers
+    is E2VID's format: width and height, then `t x y p` in seconds.
 
     Args:
         request: The file.
-        open_bytes: Opens the text; None: the file itself is the text.
+        open_bytes: Function that opens the text; None: the file itself is the text.
 
     Raises:
         ValueError: Columns or unit are unknown, a line is no row of numbers or longer than
@@ -78,7 +78,7 @@ def read_text(request: Request, open_bytes: Callable[[], IO[bytes]] | None = Non
         )
     unit = table.facts.get("time_unit", told)
     request = request.sized(*size)
-    microseconds(request, np.zeros(1), unit, table.facts.get("usual_unit"))  # refuses a missing unit now
+    microseconds(request, np.zeros(1), unit, table.facts.get("usual_unit"))  # raises if the unit is missing
     return Opened("txt", request, _parts(request, open_bytes, table, places, unit))
 
 
@@ -98,7 +98,7 @@ def _parts(
         for _ in islice(lines, table.skip):
             pass
         whole = _whole_lines(request, lines, table, columns)
-        for line in whole:  # of each part the first; the others never lie in memory together
+        for line in whole:  # the first line of each part; the others are read one by one
             part = chain([line], islice(whole, min(request.part_events, PART_LINES) - 1))
             t, x, y, p, *nanoseconds = _numbers(part, table, columns).T
             if nanoseconds:
@@ -109,7 +109,7 @@ def _parts(
 
 
 def _whole_lines(request: Request, lines: IO[str], table: Table, columns: list[int]) -> Iterator[str]:
-    """Yield the lines of a file; a last one that was cut off is counted."""
+    """Yield the complete lines of a file; count a truncated last line as damage."""
     for line in lines:
         if line.endswith("\n") or _is_whole(line, table, columns):
             yield line
@@ -131,7 +131,7 @@ def _numbers(lines: Iterable[str], table: Table, columns: list[int]) -> np.ndarr
 
 
 def _is_whole(line: str, table: Table, columns: list[int]) -> bool:
-    """Whether the last line of a file, which has no end, is a row of numbers."""
+    """Whether the last line of a file, which has no newline, is a row of numbers, a comment or empty."""
     try:
         return line.lstrip().startswith(("#", "%")) or len(_numbers([line], table, columns)) == 1
     except ValueError:
@@ -140,7 +140,7 @@ def _is_whole(line: str, table: Table, columns: list[int]) -> bool:
 
 @contextlib.contextmanager
 def _refusing(request: Request) -> Iterator[None]:
-    """Turn errors of numpy and of the decoder into a refusal of the file."""
+    """Convert errors of numpy and of the text decoder to the error for the file."""
     rows, text = "has a line that is no row of numbers ({}); repair or remove it", (UnicodeDecodeError,)
     with (
         request.refusing((ValueError,), rows),
@@ -150,7 +150,7 @@ def _refusing(request: Request) -> Iterator[None]:
 
 
 def _check_lines(request: Request, open_bytes: Callable[[], IO[bytes]]) -> None:
-    """Refuse too many lines or one that is too long, in memory that does not grow."""
+    """Raise ValueError for too many lines or a line that is too long, in constant memory."""
     lines, carried = 0, 0
     with open_bytes() as file:
         while chunk := file.read(CHUNK_BYTES):
@@ -166,7 +166,7 @@ def _check_lines(request: Request, open_bytes: Callable[[], IO[bytes]]) -> None:
 
 
 def _table(lines: IO[str]) -> Table:
-    """Return the layout that the first lines show."""
+    """Determine the layout from the first lines."""
     facts: dict[str, str] = {}
     number = -1
     for number, line in enumerate(lines):
@@ -187,7 +187,7 @@ def _table(lines: IO[str]) -> Table:
 
 
 def _facts(text: str) -> dict[str, str]:
-    """Return what a comment line says: `name: value`, `%geometry:W,H` (Metavision), or names of columns."""
+    """Parse a comment line: `name: value`, `%geometry:W,H` (Metavision), or names of columns."""
     text = text.lstrip("#% ")
     name, _, value = (part.strip() for part in text.partition(":"))
     if name == "geometry" and (size := re.fullmatch(r"(\d{1,5})[,x ]+(\d{1,5})", value)):
@@ -202,10 +202,10 @@ def _facts(text: str) -> dict[str, str]:
 
 @contextlib.contextmanager
 def text_writer(path: Path, width: int, height: int, separator: str = " ") -> Iterator[Append]:
-    """Yield a function that adds lines, under lines that say columns, unit, polarity code and sensor.
+    """Yield a function that adds lines, after comment lines with columns, unit, polarity code and sensor.
 
-    Separated by commas the first line names the columns and no other is there: what opens CSV
-    knows no comments. The sensor's size is not in such a file.
+    With commas as separator the only header is a first line with the names of the columns, because
+    readers of CSV do not support comments. Such a file does not contain the sensor's size.
     """
     about = f"# time_unit: us\n# polarity: -1 is OFF (darker), 1 is ON (brighter)\n# width: {width}\n"
     about += f"# height: {height}\n# columns: t x y p\n"

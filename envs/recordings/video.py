@@ -1,8 +1,8 @@
 """Events that an event camera would have seen while a video, or a sequence of images, was taken.
 
-Times are the video's own presentation times, less the time at which the file begins, or those of the images.
-Between two frames the camera model takes log luminance as linear, so what is faster than the frames is not in
-the events; how much that may be is estimated from the frames (`envs.recordings.frame_rate`).
+Times are the video's presentation times minus the start time of the file, or the times of the images. Between
+two frames the camera model assumes linear log luminance, so changes faster than the frames give no events.
+`envs.recordings.frame_rate` estimates how many events are missing.
 """
 
 import dataclasses
@@ -23,21 +23,21 @@ from envs.recordings.image_folder import LISTS, check_fps, even_time_us, find_im
 from envs.recordings.in_between import frames_between, open_cv
 from envs.recordings.light import TRANSFERS, Transfer, area_average, luminance, usual_floor, usual_transfer
 
-MUCH_LOST = 0.05  # of the events, from which on a warning is given
+MUCH_LOST = 0.05  # fraction of missing events from which on a warning is given
 
 
 @dataclasses.dataclass(frozen=True)
 class VideoStep:
-    """What the camera saw from one frame of a video to the next.
+    """Events from one frame of a video to the next.
 
     Attributes:
-        t_us: Time of the later frame [us], by the video's clock, less the time at which the file begins.
+        t_us: Time of the later frame [us], by the video's clock, minus the start time of the file.
         events: EVENT array, sorted by t, none later than `t_us`.
-        is_noise: bool (N,), which of them no change of the light fired.
-        dropped: Events lost to the camera's `max_events_per_pixel` and its readout.
+        is_noise: bool (N,), which events were not caused by a change of the light.
+        dropped: Number of events lost to the camera's `max_events_per_pixel` and its readout.
         width, height: Pixels of the event camera.
-        missed: About which share of the scene's events all frames until now miss, because nothing is seen
-            between them; None: too few to tell.
+        missed: Estimated fraction of the scene's events that all frames until now miss, because nothing is
+            seen between them; None: too few frames or events.
     """
 
     t_us: int
@@ -49,7 +49,7 @@ class VideoStep:
     missed: float | None
 
 
-def video_to_events(  # noqa: PLR0913 - each is a choice of its own
+def video_to_events(  # noqa: PLR0913 - each is a separate choice
     path: str | Path,
     camera: CameraConfig | None = None,
     faults: FaultsConfig | None = None,
@@ -65,22 +65,22 @@ def video_to_events(  # noqa: PLR0913 - each is a choice of its own
 
     Args:
         path: The video file, or the folder.
-        camera: The event camera; None: one with the video's own size and the default settings.
-            A video of another size is averaged onto its pixels.
-        faults: What its sensor adds; None: nothing.
+        camera: The event camera; None: a camera with the video's size and the default settings.
+            A video of another size is averaged onto the camera's pixels.
+        faults: Faults of the camera's sensor; None: none.
         transfer: As in `video_steps`.
         fps: As in `video_steps`.
         interpolate: As in `video_steps`.
         rng: As in `video_steps`.
-        max_events: Most events that are kept.
-        max_bytes: Most bytes that are opened.
+        max_events: Maximum number of events.
+        max_bytes: Maximum size of the file or of all images [bytes].
 
     Returns:
-        Events from the second frame on, which of them are noise, how many the camera dropped, and about
-        which share the frames miss.
+        Events from the second frame on, with labels of noise, the number that the camera dropped, and the
+        estimated fraction that the frames miss.
 
     Raises:
-        ValueError: As `video_steps`, or there are more than `max_events` events.
+        ValueError: As in `video_steps`, or there are more than `max_events` events.
     """
     parts, noise = [np.empty(0, EVENT)], [np.empty(0, bool)]
     count, dropped = 0, 0
@@ -111,24 +111,24 @@ def video_steps(
     rng: np.random.Generator | None = None,
     max_bytes: int = MAX_BYTES,
 ) -> Iterator[VideoStep]:
-    """Yield the events of a video or of a folder of images from frame to frame, in the memory of one frame.
+    """Yield the events of a video or of a folder of images frame by frame, with memory for one frame.
 
-    A folder has an `images.txt` with a line "time [s] name" for each image, or needs `fps`. Values of 8 and
-    16 bits and floating point are read as they are.
+    A folder must have an `images.txt` with a line "time [s] name" for each image, or another list of
+    `image_folder.LISTS`, unless `fps` is given. 8-bit, 16-bit and floating point values are read unchanged.
 
     Args:
         path: The video file, or the folder.
-        camera: The event camera; None: one with the video's own size and the default settings.
-            A video of another size is averaged onto its pixels, by area and in linear light;
+        camera: The event camera; None: a camera with the video's size and the default settings.
+            A video of another size is averaged onto the camera's pixels, by area and in linear light;
             the whole picture is used, so another aspect ratio is stretched.
-        faults: What its sensor adds; None: nothing.
-        transfer: How values become light. "srgb": IEC 61966-2-1, right for most videos and photographs;
-            "linear": in proportion. None: floating point is linear, whole numbers are sRGB.
-        fps: Frames per second, in place of the times that the video or the folder has.
-        interpolate: "linear": log luminance changes linearly from frame to frame. "flow": what moves is
-            led from one to the other (`envs.recordings.in_between`); needs OpenCV.
-        rng: Source of all draws of the noise; None: `np.random.default_rng(0)`.
-        max_bytes: Most bytes that are opened.
+        faults: Faults of the camera's sensor; None: none.
+        transfer: Conversion of values to light. "srgb": IEC 61966-2-1, right for most videos and photographs;
+            "linear": proportional. None: floating point is linear, integers are sRGB.
+        fps: Frames per second, replaces the times of the video or the folder.
+        interpolate: "linear": log luminance changes linearly from frame to frame. "flow": moving parts are
+            interpolated by optical flow (`envs.recordings.in_between`); needs OpenCV.
+        rng: Source of all noise; None: `np.random.default_rng(0)`.
+        max_bytes: Maximum size of the file or of all images [bytes].
 
     Yields:
         One `VideoStep` for every frame but the first.
@@ -136,11 +136,11 @@ def video_steps(
     Raises:
         ValueError: The file is no video, has fewer than two frames, frames of several sizes,
             frames above 2**26 pixels, values that are not finite, or times that are missing or do not
-            increase; or as `find_images`.
+            increase; or as in `find_images`.
 
     Warns:
-        UserWarning: Once, at the end, if the frames seem to miss 5 % of the events or more, and nothing but
-            a line is drawn between them.
+        UserWarning: Once, at the end, if the frames seem to miss 5 % of the events or more, and
+            `interpolate` is "linear".
     """
     path = Path(path)
     _check_options(transfer, fps, interpolate)
@@ -173,7 +173,7 @@ def video_steps(
 
 
 def _check_options(transfer: str | None, fps: float | None, interpolate: str) -> None:
-    """Raise ValueError for an option of `video_steps` that is none."""
+    """Raise ValueError for an invalid option of `video_steps`."""
     if transfer is not None and transfer not in TRANSFERS:
         raise ValueError(f"transfer must be 'srgb' or 'linear', got {transfer!r}")
     if interpolate not in ("linear", "flow"):
@@ -184,18 +184,18 @@ def _check_options(transfer: str | None, fps: float | None, interpolate: str) ->
 
 
 class Eye:
-    """An event camera and its sensor, which are shown frames of any size."""
+    """An event camera and its sensor's faults, which see frames of any size."""
 
     def __init__(
         self, config: CameraConfig, faults: FaultsConfig, rng: np.random.Generator, by_flow: bool
     ) -> None:
-        """Make it; `rng` draws the noise."""
+        """Create the camera; `rng` draws the noise."""
         self._camera, self._faults, self._rng, self._by_flow = EventCamera(config), faults, rng, by_flow
         self._loss = FrameLoss(self._camera.config)
         self._real: RealSensor | None = None
 
     def reset(self, light: np.ndarray, t_us: int) -> None:
-        """See a first frame, float32, linear."""
+        """Start at a first frame, float32, linear."""
         config = self._camera.config
         self._average = area_average(light.shape, (config.height, config.width))
         self._last = light
@@ -230,7 +230,7 @@ class Eye:
                 yield last_us + round(share * (t_us - last_us)), self._average(picture)
 
     def warn(self, path: Path) -> None:
-        """Warn if the frames seem to miss much."""
+        """Warn if the frames seem to miss many events."""
         share, half = self._loss.share, self._loss.at_half_rate
         if share is not None and half is not None and share >= MUCH_LOST and not self._by_flow:
             warnings.warn(

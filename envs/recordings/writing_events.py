@@ -22,24 +22,24 @@ def write_events(
     *,
     is_noise: np.ndarray | None = None,
 ) -> None:
-    """Write events to a file, which appears whole or not at all; `read_events` gives the same events.
+    """Write events to a file, atomically; `read_events` returns the same events.
 
-    Formats: "npz" and "hdf5" (the layout of DSEC), which EventCV opens too, "txt" and "csv" (a header names
-    columns and unit), and what the cameras' own tools open: iniVation's "aedat4", Prophesee's "dat", "evt2"
-    and "evt3".
+    Formats: "npz" and "hdf5" (DSEC's layout), which EventCV can open too; "txt" and "csv" (a header names
+    columns and unit); and the formats of the cameras' own tools: iniVation's "aedat4", Prophesee's "dat",
+    "evt2" and "evt3".
 
     Args:
-        path: The file; its folder is made. A file of that name is replaced.
+        path: The file; its folder is created, an existing file is replaced.
         events: EVENT array (N,), sorted by t.
         width: Columns of the sensor [px].
-        height: Its rows [px].
+        height: Rows of the sensor [px].
         format: One of the above; None: by the suffix (`.raw` is "evt3").
         is_noise: bool (N,), which events are noise, as `video_to_events` labels them; for "npz" and "hdf5".
 
     Raises:
         ValueError: The format is unknown, the events or labels are not valid, or the format cannot store
-            them: its clock ends before the last event (dat 2**32 us, evt2 2**34 us), or before
-            the first (evt3 2**24 us), or it has fewer pixels.
+            them: its clock ends before the last event (dat 2**32 us, evt2 2**34 us) or before
+            the first event (evt3 2**24 us), or its addresses have fewer pixels.
     """
     check_events(events, width, height)
     with event_writer(path, width, height, format, is_labelled=is_noise is not None) as write:
@@ -50,20 +50,20 @@ def write_events(
 def event_writer(
     path: str | Path, width: int, height: int, format: str | None = None, *, is_labelled: bool = False
 ) -> Iterator[Write]:
-    """Yield a function that adds events to a file, in memory that is bounded by the part.
+    """Yield a function that adds events to a file part by part, with memory for one part.
 
-    The file appears when the block ends without an error. The function takes an EVENT array that begins no
-    earlier than the last one ended, and labels if the file has them.
+    The file appears when the block ends without an error. The function takes an EVENT array that starts no
+    earlier than the previous one ended, and labels if the file has them.
 
     Args:
         path: As in `write_events`.
-        width: As there.
-        height: As there.
-        format: As there.
+        width: As in `write_events`.
+        height: As in `write_events`.
+        format: As in `write_events`.
         is_labelled: Whether each part comes with labels of noise.
 
     Raises:
-        ValueError: As `write_events`.
+        ValueError: As in `write_events`.
     """
     path = Path(path)
     kind = format or WRITTEN_SUFFIXES.get(path.suffix.lower(), "")

@@ -1,7 +1,7 @@
 """The world: obstacles, textures and layouts, what the vehicle hits, and how far it sees.
 
-`Scene` and `make_scene` are imported when they are first used: they need numba, which takes long to
-load, and the launcher checks a scene's name without it.
+`Scene` and `make_scene` are imported at their first use, because they need numba, which is slow to load.
+The launcher checks a scene's name without it.
 """
 
 from typing import TYPE_CHECKING
@@ -31,7 +31,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> object:
-    """`Scene` or `make_scene`, at their first use."""
+    """Import `Scene` or `make_scene` at its first use."""
     if name not in ("Scene", "make_scene"):
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from envs.scene import scene

@@ -1,4 +1,4 @@
-"""Collision kernels: first contact of a swept disc, ways through a corridor, points kept apart.
+"""Collision kernels: first contact of a swept disc, paths through a corridor, points at a minimum distance.
 
 Bodies are level sections, rows (x, y, ux, uy, hx, hy, r) as `envs.scene.obstacles` describes them.
 Kernels assume finite input; `envs.scene.scene` checks it.
@@ -9,8 +9,8 @@ import math
 import numba
 import numpy as np
 
-CELL_M = 0.1  # of the lattice on which ways are searched
-MARGIN = 1.0 + 1e-9  # times a size: rounding cannot make it too small
+CELL_M = 0.1  # cell size of the lattice on which paths are searched
+MARGIN = 1.0 + 1e-9  # factor on a size, so that rounding cannot make it too small
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -31,7 +31,7 @@ def first_contact(segment: tuple, radius: float, half_width: float, sections: np
         reach = sections[i, 6] + radius
         size = (hx + hy + reach) * MARGIN
         if left - x > size or x - right > size or near - y > size or y - far > size:
-            continue  # most are far away, and this test is quick
+            continue  # a quick test, because most sections are far away
         ux, uy = sections[i, 2], sections[i, 3]
         a = ((ax - x) * ux + (ay - y) * uy, (ay - y) * ux - (ax - x) * uy)
         b = ((bx - x) * ux + (by - y) * uy, (by - y) * ux - (bx - x) * uy)
@@ -44,15 +44,15 @@ def first_contact(segment: tuple, radius: float, half_width: float, sections: np
 
 @numba.njit(cache=True, error_model="numpy")
 def first_moving_contact(segment: tuple, radius: float, moving: np.ndarray, shares: tuple) -> float:
-    """Return the smallest fraction of `segment` in contact with a section that moves, or inf.
+    """Return the smallest fraction of `segment` in contact with a moving section, or inf.
 
-    Seen from the section, the way of the disc is straight too.
+    In the frame of the section, the way of the disc is straight too.
 
     Args:
-        segment: As of `first_contact`.
+        segment: As for `first_contact`.
         radius: Radius of the disc [m].
-        moving: (N, 9) float64, a section at the begin of the step, and its way in the step, x, y [m].
-        shares: The parts of the step that have passed at the begin and at the end of the segment.
+        moving: (N, 9) float64, sections at the start of the step and their displacements in it, x, y [m].
+        shares: Fractions of the step that have passed at the start and at the end of the segment.
     """
     ax, ay, bx, by = segment
     begin, end = shares
@@ -81,7 +81,7 @@ def _disc_contact(a: tuple, b: tuple, reach: float) -> float:
         return 0.0
     dx, dy = b[0] - a[0], b[1] - a[1]
     length = math.hypot(dx, dy)
-    # Asked first, so that a segment never ends in what the next one would start in.
+    # Contact at the end counts, so that no segment ends where the next one would start in contact.
     last = 1.0 if math.hypot(b[0], b[1]) <= reach else math.inf
     if length == 0.0:
         return last
@@ -89,7 +89,7 @@ def _disc_contact(a: tuple, b: tuple, reach: float) -> float:
     miss = abs(a[0] * dy - a[1] * dx) / length
     if along <= 0.0 or miss > reach:
         return last
-    # The smaller root as C / (larger root): the plain difference cancels just outside the disc.
+    # The smaller root as C / (larger root): the plain difference would cancel just outside the disc.
     larger = along + math.sqrt((reach - miss) * (reach + miss))
     contact = (start - reach) * (start + reach) / (larger * length)
     return contact if contact <= 1.0 else last
@@ -97,9 +97,9 @@ def _disc_contact(a: tuple, b: tuple, reach: float) -> float:
 
 @numba.njit(cache=True, error_model="numpy")
 def _box_contact(a: tuple, b: tuple, half: tuple, reach: float) -> float:
-    """Return the first contact of a-b with all points within `reach` of the rectangle of half-sizes `half`.
+    """Return the first contact of a-b with the points within `reach` of the rectangle of half-sizes `half`.
 
-    These are two rectangles, one longer and one wider by `reach`, and a disc at each corner.
+    These points are two rectangles, one longer and one wider by `reach`, and a disc at each corner.
     """
     hx, hy = half
     if _distance(a, hx, hy) <= reach:
@@ -140,22 +140,22 @@ def ways_to_goal(
 ) -> np.ndarray:
     """Find the places from which a vehicle that flies ahead or 45 degrees to a side reaches the goal line.
 
-    A place of the lattice is open if it keeps one cell more than `radius` from everything,
-    and leads to the goal if it is open and so does a place one cell ahead: straight, left or
-    right. One cell is enough for a vehicle that starts up to half a cell beside a place and
-    flies parallel to its way: it is never more than sqrt(10) / 4 = 0.79 cells from the
-    nearest place of that way. So True is a proof; False may be a gap a few cells too narrow.
+    A place of the lattice is open if it is at least `radius` plus one cell away from everything. It leads to
+    the goal if it is open and if a place one cell ahead (straight, left or right) leads to the goal. One cell
+    is enough for a vehicle that starts up to half a cell to the side of a place and flies parallel to the
+    path: it is never more than sqrt(10) / 4 = 0.79 cells from the nearest place of that path. So True is a
+    proof; False may mean a gap that is a few cells too narrow.
 
     Args:
         sections: (N, 7) float64.
         radius: Radius of the vehicle [m].
         half_width: The walls are at x = +-half_width [m].
         length: The goal line is at y = length [m].
-        columns: Of the lattice, on either side of x = 0.
+        columns: Columns of the lattice on either side of x = 0.
 
     Returns:
-        bool (rows, 2 * columns + 3): place [j, columns + 1 + i] is x = i * CELL_M,
-        y = j * CELL_M; the outermost columns are never open.
+        bool (rows, 2 * columns + 3); element [j, columns + 1 + i] is at x = i * CELL_M, y = j * CELL_M. The
+        outermost columns are never open.
     """
     reach = radius + CELL_M
     rows = math.ceil(length / CELL_M) + 1
@@ -180,7 +180,7 @@ def _close(places: np.ndarray, section: np.ndarray, reach: float, middle: int) -
     size = section[6] + reach
     wide, deep = abs(ux) * hx + abs(uy) * hy + size, abs(uy) * hx + abs(ux) * hy + size
     rows, columns = places.shape
-    # Clipped as floats: a section may lie farther away than an integer can count cells.
+    # Clip as floats: a distant section may exceed the integer range in cells.
     first_j, last_j = max((y - deep) / CELL_M, 0.0), min((y + deep) / CELL_M, rows - 1.0)
     first_i = max((x - wide) / CELL_M, float(-middle))
     last_i = min((x + wide) / CELL_M, float(columns - 1 - middle))
@@ -196,7 +196,7 @@ def _close(places: np.ndarray, section: np.ndarray, reach: float, middle: int) -
 
 @numba.njit(cache=True, error_model="numpy")
 def keep_apart(tries: np.ndarray, min_gap_m: float, count: int) -> np.ndarray:
-    """Return the first `count` points of `tries` that are `min_gap_m` from all points chosen before."""
+    """Return the first `count` points of `tries` at least `min_gap_m` from all points chosen before."""
     kept = np.empty((count, 2))
     size = 0
     for i in range(len(tries)):

@@ -1,10 +1,9 @@
 """Layouts of corridors as data: what stands in them, how much of it, how it looks.
 
-A new corridor is one more `Layout` in `LAYOUTS`, or a `MeshLayout` with the path of its file. The
-sources are the appendix's B.1 (poles, cones and gates, from which the event data are made), D.1 (the
-training lane), D.2 (the evaluation scenes) and F.1 (moving textures). It describes them in words with few
-numbers, so the numbers are our choices, made for a camera at 2 m above the ground and a vehicle of radius
-0.3 m.
+To add a corridor, add a `Layout` to `LAYOUTS`, or use a `MeshLayout` with the path of its file. The sources
+are the paper's appendices B.1 (poles, cones and gates for the event data), D.1 (the training lane), D.2 (the
+evaluation scenes) and F.1 (moving textures). The paper gives few numbers, so most numbers are our choices,
+for a camera 2 m above the ground and a vehicle of radius 0.3 m.
 """
 
 import dataclasses
@@ -23,14 +22,14 @@ from envs.scene.textures import Texture
 
 SPAWN_RANGE_M = (-10.0, 10.0)  # appendix D.1
 TRIES_PER_OBSTACLE = 200
-MAX_THROWS = 100  # of an episode
-THROWN_FROM_RAD = math.radians(30.0)  # at most so far beside straight ahead a ball comes from
+MAX_THROWS = 100  # per episode
+THROWN_FROM_RAD = math.radians(30.0)  # largest bearing, left or right of straight ahead, of a thrown ball
 MAX_COVERED = math.pi / math.sqrt(12.0)  # largest share of an area that equal discs can cover
 PLAIN_SURFACE = Texture()
 
 
 def refuse_unless(rules: dict[str, bool], what: str, record: Any) -> None:
-    """Raise ValueError for the first rule that does not hold, with the values of the fields it names."""
+    """Raise ValueError for the first rule that does not hold, with the values of the fields in the rule."""
     for rule, holds in rules.items():
         if not holds:
             names = [field.name for field in dataclasses.fields(record)]
@@ -39,10 +38,10 @@ def refuse_unless(rules: dict[str, bool], what: str, record: Any) -> None:
 
 
 def check_types(layout: Any) -> None:
-    """Check that each field is a number in [0, 100000], a boolean or a texture, as its default is.
+    """Check that each field has the type of its default; a number must be in [0, 100000].
 
     Raises:
-        ValueError: Names the field and the value.
+        ValueError: A field is wrong; the message names the field and the value.
     """
     for field in dataclasses.fields(layout):
         value = getattr(layout, field.name)
@@ -65,24 +64,23 @@ class Layout:
         shape: A row of `envs.scene.shapes`: "pole", "cone", "ellipsoid" (round seen from above), "box"
             (square seen from above), "gate" (a frame across the lane) or "tree" (a crown on a trunk).
             All stand on the ground.
-        num_obstacles: How many.
-        radius_min_m, radius_max_m: Radii are uniform between these [m]: of poles, of the
-            base of cones, the level half-axis of ellipsoids and crowns, half the side of boxes, half the
-            inside width of gates.
+        num_obstacles: Number of obstacles.
+        radius_min_m, radius_max_m: Range of the uniform radii [m]: radius of poles and of the base of cones,
+            level half-axis of ellipsoids and crowns, half the side of boxes, half the inside width of gates.
         height_m: Height of every obstacle [m].
         min_gap_m: Smallest distance between two axes [m].
-        first_y_m, last_y_m: The axes stand at y uniform between these [m].
-        width_m, wall_height_m: The lane and its walls [m].
-        albedo_min, albedo_max: Albedos of obstacles are uniform between these.
-        ground_albedo, wall_albedo: Of the rest.
+        first_y_m, last_y_m: Range of the uniform y of the axes [m].
+        width_m, wall_height_m: Width of the lane and height of its walls [m].
+        albedo_min, albedo_max: Range of the uniform albedos of obstacles.
+        ground_albedo, wall_albedo: Albedos of the ground and the walls.
         ground_texture, wall_texture, obstacle_texture: See `envs.scene.textures`.
-        passable: Whether a way to the goal line must lead from every start; bodies that move do not count.
-        num_moving: How many spheres fly to and fro across the lane at the vehicle's height.
-        moving_radius_m: Their radius [m].
-        moving_min_mps, moving_max_mps: Their speeds are uniform between these [m/s].
-        throw_every_s: Mean time between two balls that are thrown at the vehicle [s]; 0: none is.
-        throw_distance_m: From the vehicle, where a ball starts [m].
-        throw_min_mps, throw_max_mps: How fast a ball comes nearer is uniform between these [m/s].
+        passable: Whether a path to the goal line must exist from every start; moving bodies do not count.
+        num_moving: Number of spheres that fly to and fro across the lane at the vehicle's height.
+        moving_radius_m: Radius of the moving spheres [m].
+        moving_min_mps, moving_max_mps: Range of the uniform speeds of the moving spheres [m/s].
+        throw_every_s: Mean time between two balls thrown at the vehicle [s]; 0: no balls.
+        throw_distance_m: Distance from the vehicle at which a ball starts [m].
+        throw_min_mps, throw_max_mps: Range of the uniform closing speed of a ball [m/s].
         throw_radius_m: Radius of a ball [m].
     """
 
@@ -152,9 +150,9 @@ class MeshLayout:
 
     Attributes:
         scale: Metres per unit of the file.
-        width_m, wall_height_m: The lane and its walls [m].
-        passable: Whether a way to the goal line must lead from every start.
-        file: Path of what `envs.scene.mesh_file` reads.
+        width_m, wall_height_m: Width of the lane and height of its walls [m].
+        passable: Whether a path to the goal line must exist from every start.
+        file: Path of the mesh file, read by `envs.scene.mesh_file`.
     """
 
     scale: float = 1.0
@@ -175,17 +173,17 @@ class MeshLayout:
 
 @dataclass(frozen=True)
 class SphereLayout:
-    """A world of spheres, of a file or drawn as the DodgeDrone challenge draws them (`envs.scene.spheres`).
+    """A world of spheres, read from a file or drawn as in the DodgeDrone challenge (`envs.scene.spheres`).
 
     Attributes:
         file: Path of a CSV file; "": drawn again for each episode.
-        density: Times as many spheres as the challenge's generator draws, without a file.
-        length_m: The goal line [m].
-        width_m, wall_height_m: The lane and its walls, at which a flight ends [m]. The challenge's box has no
-            visible walls, so these are low.
-        spawn_half_m: A start is at x uniform in +- this [m].
-        moving: Whether the spheres of `dynamic_obstacles.yaml` beside the file move in it too.
-        passable: Whether a way to the goal line must lead from every start.
+        density: Number of spheres as a multiple of what the challenge's generator draws; unused with a file.
+        length_m: y of the goal line [m].
+        width_m, wall_height_m: Width of the lane and height of its walls, which end a flight [m]. The
+            challenge's box has no visible walls, so these walls are low.
+        spawn_half_m: Half of the range of the uniform x at the start [m].
+        moving: Whether to add the moving spheres of `dynamic_obstacles.yaml` in the file's folder.
+        passable: Whether a path to the goal line must exist from every start.
     """
 
     file: str = ""
@@ -213,9 +211,9 @@ class SphereLayout:
 AnyLayout = TypeVar("AnyLayout", bound=Layout | MeshLayout | SphereLayout)
 POLES_EVAL = Layout(num_obstacles=80, width_m=50.0)
 
-# Cones are as wide as poles where the camera flies, 2 m above the ground; so are ellipsoids,
-# whose middle is there. Hence the places where a vehicle fits through are the same, and a
-# difference in success between these layouts and `poles_eval` is one of looks alone.
+# At the camera's height, 2 m, cones are as wide as poles, and so are ellipsoids, whose centre is there. A
+# vehicle therefore fits through the same places, and a difference in success between these layouts and
+# `poles_eval` comes from appearance alone.
 LAYOUTS: dict[str, Layout | MeshLayout | SphereLayout] = {
     "poles": Layout(),
     "cones": Layout("cone", radius_min_m=0.75, radius_max_m=0.75, height_m=6.0),
@@ -246,7 +244,7 @@ def with_overrides(layout: AnyLayout, overrides: Mapping[str, object]) -> AnyLay
     """Return the layout with some of its fields replaced.
 
     Raises:
-        ValueError: A key is no field of the layout, or its value is refused.
+        ValueError: A key is not a field of the layout, or its value is invalid.
     """
     known = [field.name for field in dataclasses.fields(layout)]
     values = dict(overrides)
@@ -259,7 +257,7 @@ def with_overrides(layout: AnyLayout, overrides: Mapping[str, object]) -> AnyLay
 
 
 def _with_texture(key: str, texture: object, changes: Mapping[str, Any]) -> Texture:
-    """Return a texture with some fields replaced; whole numbers and pairs may come as floats and lists."""
+    """Return a texture with some fields replaced; integers may be given as floats and pairs as lists."""
     known = [field.name for field in dataclasses.fields(Texture)]
     wrong = [name for name in changes if name not in known]
     if not isinstance(texture, Texture) or wrong:
@@ -274,21 +272,21 @@ def draw_obstacles(layout: Layout, rng: np.random.Generator) -> np.ndarray:
     """Draw obstacles in the lane, axes `min_gap_m` apart, by rejection with a bounded number of tries.
 
     Returns:
-        (M,) OBSTACLE, place by place; a gate is four of them.
+        (M,) OBSTACLE, place by place; a gate is four records.
 
     Raises:
-        ValueError: If so many do not fit.
+        ValueError: The obstacles do not fit.
     """
     count = int(layout.num_obstacles)
     shape = SHAPES[layout.shape]
     half = 0.5 * layout.width_m - layout.radius_max_m - shape.bar_m
-    if _share_covered(layout, half) > MAX_COVERED:  # asked first: the tries would take minutes
+    if _share_covered(layout, half) > MAX_COVERED:  # checked first, because the tries would take minutes
         raise ValueError(
             f"layout num_obstacles={count} cannot be placed {layout.min_gap_m} m apart; "
             "lower num_obstacles or min_gap_m, or widen the lane"
         )
     tries = rng.uniform((-half, layout.first_y_m), (half, layout.last_y_m), (TRIES_PER_OBSTACLE * count, 2))
-    from envs.scene.collision import keep_apart  # loads numba, which a check of names does without
+    from envs.scene.collision import keep_apart  # loads numba, which a check of names does not need
 
     kept = keep_apart(tries, layout.min_gap_m, count)
     if len(kept) < count:
@@ -326,7 +324,7 @@ def draw_moving(layout: Layout, rng: np.random.Generator, height_m: float) -> tu
 
 
 def draw_throws(layout: Layout, rng: np.random.Generator, height_m: float) -> Throws | None:
-    """Draw when balls are thrown at the vehicle, whence, and how fast; None if none is."""
+    """Draw times, bearings and speeds of the balls thrown at the vehicle; None if there are none."""
     if not layout.throw_every_s:
         return None
     times = np.cumsum(layout.throw_every_s * rng.uniform(0.5, 1.5, MAX_THROWS))

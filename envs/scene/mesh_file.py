@@ -10,38 +10,37 @@ if TYPE_CHECKING:
     import trimesh
 
 MAX_BYTES, MAX_FACES = 500_000_000, 5_000_000
-PLAIN_ALBEDO = 0.25  # of surfaces without a colour; that of poles
-LUMA = np.array([0.2126, 0.7152, 0.0722])  # of linear red, green and blue (Rec. 709)
+PLAIN_ALBEDO = 0.25  # of surfaces without a colour, the same as poles
+LUMA = np.array([0.2126, 0.7152, 0.0722])  # weights of linear red, green and blue (Rec. 709)
 Y_UP = (".glb", ".gltf")
 
 
 def is_mesh_path(name: str) -> bool:
-    """Whether the name of a scene is the path of a file: it has a suffix or a folder in it."""
+    """Whether the name of a scene is a file path, that is, has a suffix or a folder."""
     return bool(Path(name).suffix) or os.sep in name
 
 
 def read_mesh(path: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Read a mesh file in any format of `trimesh`: glTF, OBJ, OFF, PLY, STL and more.
 
-    glTF is y-up by its standard, so (x, y, z) becomes (x, -z, y): what faced -z, away from
-    the viewer, then lies ahead. Other formats are taken as they are: metres, z up.
+    glTF is y-up by its standard, so (x, y, z) becomes (x, -z, y): glTF's -z, away from the
+    viewer, then points ahead. Other formats are not turned: metres, z up.
 
     The albedo is the luma of linear colour. glTF's factors and vertex colours are linear;
-    textures and the colours of other formats are taken as sRGB and made linear. A texture
-    is read at the corners of the triangles only. Transparency is ignored.
+    textures and the colours of other formats are read as sRGB and converted to linear. A
+    texture is sampled at the corners of the triangles only. Transparency is ignored.
 
     Args:
-        path: Path of the file; textures and materials are looked for beside it.
+        path: Path of the file; textures and materials are looked for in its folder.
 
     Returns:
-        Corners (F, 3, 3) float64 [m], unit normals (F, 3) float64 and albedos (F, 3)
-        float64 in [0, 1]. Triangles without area are left out.
+        Corners (F, 3, 3) float64 [m], unit normals (F, 3) float64 and the albedo of each
+        corner (F, 3) float64 in [0, 1]. Triangles without area are left out.
 
     Raises:
         ValueError: There is no such file, it is too large, or it holds no usable triangles.
     """
-    # Imported here because only mesh files need it.
-    import trimesh
+    import trimesh  # only mesh files need it
 
     file = Path(path)
     if not file.is_file():
@@ -71,7 +70,7 @@ def _load(path: str) -> "list[trimesh.Trimesh] | None":
     import trimesh
 
     scene = trimesh.load_scene(path, process=False)
-    # Counted before anything is copied: a small file may place one mesh a thousand times.
+    # Count before copying: a small file may place one mesh a thousand times.
     names = [scene.graph[node][1] for node in scene.graph.nodes_geometry]
     if sum(len(getattr(scene.geometry[name], "faces", ())) for name in names) > MAX_FACES:
         return None
@@ -103,7 +102,7 @@ def _albedo(part: "trimesh.Trimesh", linear: bool) -> np.ndarray:
 
 
 def _material_albedo(part: "trimesh.Trimesh", linear: bool) -> np.ndarray:
-    """Return the albedo of the material, its colour times its texture; (F, 3), or one value."""
+    """Return the albedo of the material, its colour times its texture, (F, 3) or one value."""
     from trimesh.visual.color import uv_to_color
     from trimesh.visual.material import PBRMaterial
 
@@ -122,11 +121,11 @@ def _luma(colours: Any, linear: bool) -> np.ndarray:
 
 
 def _weighted(rgb: np.ndarray) -> np.ndarray:
-    """Return the luminance of red, green and blue (..., 3); BLAS would round it by the number of threads."""
+    """Return the luma of red, green and blue (..., 3); not by BLAS, whose rounding depends on its threads."""
     return np.asarray((rgb * LUMA).sum(axis=-1))
 
 
 def _linear(colours: Any, linear: bool) -> np.ndarray:
-    """Convert colours uint8 (..., 3 or 4) to red, green and blue in [0, 1], from sRGB unless `linear`."""
+    """Convert colours, uint8 (..., 3 or 4), to linear RGB in [0, 1]; they are sRGB unless `linear`."""
     rgb = np.asarray(colours)[..., :3] / 255.0
     return rgb if linear else np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)

@@ -1,8 +1,8 @@
 """Bodies that move: straight from place to place, at constant speed between two places.
 
-Two places and their times are a velocity and an interval; a list of them is a recorded path. A body rests at
-its first place before the path begins, and at its last place when the path is over; a path that repeats
-begins again there. Bodies never turn.
+A path is a list of places with their times: two give a constant velocity over an interval, many a recorded
+path. A body rests at its first place until the path begins. When the path is over, the body rests at the last
+place, or starts the path again if it repeats. Bodies never turn.
 """
 
 import math
@@ -14,18 +14,18 @@ import numpy as np
 
 from envs.scene.obstacles import OBSTACLE
 
-THROWN_S = 30.0  # for which a thrown ball flies on
+THROWN_S = 30.0  # flight time of a thrown ball
 
 
 @dataclass(frozen=True, eq=False)
 class MovingBody:
-    """A body on its path; ValueError names the rule that it breaks.
+    """A body on its path; ValueError names the broken rule.
 
     Attributes:
-        body: OBSTACLE (), what moves; the path stands for its x, y and z.
-        t_s: float64 (K,), when it is at each place, ascending from 0 or later [s].
-        places_m: float64 (K, 3), x, y, z of its centre [m].
-        repeats: Whether the path begins again when it is over.
+        body: OBSTACLE (), the moving body; the path replaces its x, y and z.
+        t_s: float64 (K,), time at each place, ascending, >= 0 [s].
+        places_m: float64 (K, 3), x, y, z of the body's centre [m].
+        repeats: Whether the path starts again when it is over.
     """
 
     body: np.void
@@ -50,14 +50,14 @@ class MovingBody:
             object.__setattr__(self, name, array)
 
     def places(self, t_s: np.ndarray) -> np.ndarray:
-        """Return where its centre is at times (T,) [s]: x, y, z [m], float64 (T, 3)."""
+        """Return the body's centre at times (T,) [s]: x, y, z [m], float64 (T, 3)."""
         first, last = self.t_s[0], self.t_s[-1]
         if self.repeats and last > first:
             t_s = np.where(t_s > last, first + (t_s - first) % (last - first), t_s)
         return np.stack([np.interp(t_s, self.t_s, axis) for axis in self.places_m.T], axis=-1)
 
     def place(self, t_s: float) -> np.ndarray:
-        """Return where its centre is at a time [s]: x, y, z [m], float64 (3,)."""
+        """Return the body's centre at a time [s]: x, y, z [m], float64 (3,)."""
         place: np.ndarray = self.places(np.array([t_s]))[0]
         return place
 
@@ -66,9 +66,9 @@ class Throw(NamedTuple):
     """A ball that is thrown at the vehicle.
 
     Attributes:
-        t_s: When, or in the first control step that begins later [s].
-        bearing_rad: Where it comes from, to the right of straight ahead [rad].
-        speed_mps: How fast it comes nearer to a vehicle that keeps its velocity [m/s].
+        t_s: Time of the throw [s]; the ball starts with the first control step at or after it.
+        bearing_rad: Bearing that it comes from, to the right of straight ahead [rad].
+        speed_mps: Closing speed for a vehicle at constant velocity [m/s].
     """
 
     t_s: float
@@ -81,8 +81,8 @@ class Throws(NamedTuple):
 
     Attributes:
         ball: OBSTACLE (), an ellipsoid.
-        distance_m: From the vehicle, where each begins [m].
-        throws: By time.
+        distance_m: Distance from the vehicle at which each throw starts [m].
+        throws: The throws in the order of time.
     """
 
     ball: np.void
@@ -94,9 +94,9 @@ class Throws(NamedTuple):
         return MovingBody(self.ball, np.zeros(1), np.array([[0.0, -1e4, float(self.ball["z"])]]))
 
     def thrown(self, number: int, t_s: float, state: tuple[float, float, float, float]) -> MovingBody:
-        """Return the ball on its way from a time [s] at a vehicle of `state` x, y [m], vx, vy [m/s].
+        """Return the ball thrown at time `t_s` [s] at a vehicle of `state` x, y [m], vx, vy [m/s].
 
-        It hits a vehicle that keeps its velocity in the middle, and flies on.
+        It hits the centre of a vehicle at constant velocity, and flies on.
         """
         _, bearing_rad, speed_mps = self.throws[number]
         x_m, y_m, vx_mps, vy_mps = state
@@ -110,7 +110,7 @@ class Throws(NamedTuple):
 def at_velocity(
     body: np.void, velocity_mps: Sequence[float], begin_s: float = 0.0, end_s: float = 1e4
 ) -> MovingBody:
-    """Return a body that moves from its own place at a velocity (x, y, z) from `begin_s` to `end_s`.
+    """Return a body that moves from its place at a velocity (x, y, z) [m/s] from `begin_s` to `end_s` [s].
 
     Raises:
         ValueError: The interval is empty, or a number is not finite.

@@ -3,10 +3,10 @@
 x, y, z is the centre of an obstacle and rx, ry, rz are its half-axes [m]; the bottom is at
 z - rz, the top at z + rz. Bodies stand upright: poles, cones and ellipsoids are round about
 their vertical axis (rx = ry); a cone has its base of radius rx at the bottom and its apex at
-the top; a box is aligned with the axes, and four of them make a gate. Bodies do not overlap.
+the top; a box is aligned with the axes, and four boxes form a gate. Bodies do not overlap.
 
-A section is a level rectangle with rounded corners, the row (x, y, ux, uy, hx, hy, r): all
-points within r of the rectangle around (x, y) whose half-sizes are hx along (ux, uy) and hy
+A section is a level rectangle with rounded corners, stored as a row (x, y, ux, uy, hx, hy, r):
+all points within r of the rectangle around (x, y) with half-sizes hx along (ux, uy) and hy
 across it. A disc has hx = hy = 0, a box has r = 0, a straight edge has hy = r = 0.
 """
 
@@ -26,14 +26,14 @@ OBSTACLE = np.dtype(
 )
 POLE, CONE, ELLIPSOID, BOX = range(4)
 KINDS = ("pole", "cone", "ellipsoid", "box")
-ROUNDING = 1e-6  # by which a product of an albedo, which is float32, may exceed 1
+ROUNDING = 1e-6  # excess over 1 allowed to a product with an albedo, which is float32
 
 
 def checked_obstacles(obstacles: np.ndarray, contrast: float) -> np.ndarray:
-    """Check obstacles whose texture raises the albedo by `contrast` at most; return a read-only copy.
+    """Check obstacles whose texture raises the albedo by at most `contrast`; return a read-only copy.
 
     Raises:
-        ValueError: They are not OBSTACLE records, or one breaks a rule; both are named.
+        ValueError: The array is not of OBSTACLE records, or a record breaks a rule; the message names both.
     """
     if getattr(obstacles, "dtype", None) != OBSTACLE or obstacles.ndim != 1:
         raise ValueError(f"obstacles must be a 1-D array of scene.OBSTACLE, got {obstacles!r:.80}")
@@ -77,14 +77,14 @@ def checked_mesh(vertices: np.ndarray, faces: np.ndarray, luminance: np.ndarray)
 
 
 def body_sections(obstacles: np.ndarray, height_m: float) -> np.ndarray:
-    """Return the sections of bodies at the plane z = `height_m`; top and bottom belong to a body.
+    """Return the sections of bodies at the plane z = `height_m`; a body includes its top and bottom.
 
     Args:
         obstacles: (N,) OBSTACLE.
         height_m: Height of the plane [m].
 
     Returns:
-        (M, 7) float64 sections of the M <= N bodies that reach the plane, in their order.
+        (M, 7) float64 sections of the M <= N bodies that reach the plane, in the same order.
     """
     up = height_m - (obstacles["z"] - obstacles["rz"])  # above the bottom
     down = (obstacles["z"] + obstacles["rz"]) - height_m  # below the top
@@ -94,8 +94,7 @@ def body_sections(obstacles: np.ndarray, height_m: float) -> np.ndarray:
     cone, ellipsoid = bodies["kind"] == CONE, bodies["kind"] == ELLIPSOID
     share[cone] = down[cone] / (2.0 * bodies["rz"][cone])
     share[ellipsoid] = np.sqrt(up[ellipsoid] * down[ellipsoid]) / bodies["rz"][ellipsoid]
-    # Rounding never makes a section wider than its body.
-    share = np.minimum(share, 1.0)
+    share = np.minimum(share, 1.0)  # so that rounding never makes a section wider than its body
     box = bodies["kind"] == BOX
     sections = np.zeros((len(bodies), 7))
     sections[:, 0], sections[:, 1], sections[:, 2] = bodies["x"], bodies["y"], 1.0
@@ -107,8 +106,8 @@ def body_sections(obstacles: np.ndarray, height_m: float) -> np.ndarray:
 def mesh_sections(vertices: np.ndarray, faces: np.ndarray, height_m: float) -> np.ndarray:
     """Return the straight edges in which the plane z = `height_m` cuts the surfaces of a mesh.
 
-    A face that touches the plane along an edge or at a corner counts, and one that lies in
-    it gives its three edges. Faces that share an edge give the same point on it, bit for bit.
+    A face that touches the plane along an edge or at a corner counts. A face that lies in the plane gives its
+    three edges. Faces that share an edge give the same point on that edge, bit for bit.
 
     Args:
         vertices: (V, 3) [m].
@@ -125,7 +124,7 @@ def mesh_sections(vertices: np.ndarray, faces: np.ndarray, height_m: float) -> n
     following = np.array([1, 2, 0])
     flip = signs > 0.0
     crossing = (flip & (signs[:, following] < 0.0)) | ((signs < 0.0) & flip[:, following])
-    # From below to above, whatever the order of the face, so that neighbours agree.
+    # From below to above, whatever the order of the corners, so that neighbouring faces agree.
     low = np.where(flip[..., None], places[:, following], places)
     high = np.where(flip[..., None], places, places[:, following])
     a, b = np.where(flip, signs[:, following], signs), np.where(flip, signs, signs[:, following])

@@ -1,6 +1,7 @@
-"""Where moving bodies are: their places at a time, and the sections that they have at a height.
+"""Places of moving bodies at a time, and their sections at a height.
 
-Apart from `envs.scene.moving`, because numba takes long to load, and a layout is checked without it.
+This is separate from `envs.scene.moving` because numba is slow to load, and checking a layout does not need
+it.
 """
 
 from collections.abc import Sequence
@@ -32,9 +33,9 @@ class Paths(NamedTuple):
 
     Attributes:
         t_s: Times, float64 (P,).
-        places_m: x, y, z at them, float64 (P, 3).
-        begins: int64 (M + 1,), where each path begins, and where the last one ends.
-        repeats: bool (M,).
+        places_m: x, y, z at these times, float64 (P, 3).
+        begins: int64 (M + 1,), index at which each path begins, and the end of the last path.
+        repeats: Whether each path repeats, bool (M,).
     """
 
     t_s: np.ndarray
@@ -45,7 +46,7 @@ class Paths(NamedTuple):
 
 @lru_cache(maxsize=64)
 def _paths(moving: tuple[MovingBody, ...]) -> tuple[np.ndarray, Paths]:
-    """Return bodies (M,) OBSTACLE, not to be changed, and their paths."""
+    """Return bodies (M,) OBSTACLE and their paths; both are cached, so do not change them."""
     times, places = [one.t_s for one in moving], [one.places_m for one in moving]
     begins = np.cumsum([0, *map(len, times)])
     repeats = np.array([one.repeats for one in moving])
@@ -55,7 +56,7 @@ def _paths(moving: tuple[MovingBody, ...]) -> tuple[np.ndarray, Paths]:
 
 @numba.njit(cache=True, error_model="numpy")
 def _find_places(paths: Paths, t_s: float, places: np.ndarray) -> None:
-    """Fill in the place of each body at a time, (M, 3): the bytes of `MovingBody.places`."""
+    """Write the place of each body at a time, (M, 3), the same bytes as `MovingBody.places` returns."""
     for k in range(len(places)):
         times, own = paths.t_s[paths.begins[k] : paths.begins[k + 1]], paths.places_m[paths.begins[k] :]
         first, last, now = times[0], times[-1], t_s
@@ -73,16 +74,16 @@ def _find_places(paths: Paths, t_s: float, places: np.ndarray) -> None:
 def moving_sections(
     moving: Sequence[MovingBody], start_s: float, end_s: float, height_m: float, found: np.ndarray
 ) -> None:
-    """Fill in the sections that bodies have at a height [m], and their ways from a time to another [s].
+    """Write the sections of moving bodies at a height, and their displacements between two times.
 
-    The section of a body that climbs or sinks is that half-way.
+    If a body climbs or sinks, its section is taken half-way in time.
 
     Args:
         moving: M bodies.
-        start_s: When the section is where it says [s].
-        end_s: When it has moved [s].
-        height_m: Of the vehicle [m].
-        found: float64 (M, 9), sections as of `envs.scene.obstacles`, and their way x, y [m].
+        start_s: Time of the sections' positions [s].
+        end_s: Time at the end of the displacement [s].
+        height_m: Height of the vehicle [m].
+        found: float64 (M, 9), filled with sections as in `envs.scene.obstacles` and displacements x, y [m].
     """
     before, after = bodies_at(moving, start_s), bodies_at(moving, end_s)
     level = before.copy()

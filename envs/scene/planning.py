@@ -1,9 +1,9 @@
 """The cheapest way to the goal line from anywhere in a corridor, by dynamic programming on a lattice.
 
-A vehicle that knows the geometry moves on a lattice of `LATTICE_M` by steps ahead or 45 degrees to a side.
-Each place has a price, which falls with its clearance. Geometry is the scene's: bodies, gates as their posts,
-and of a mesh the surfaces that the vehicle's height cuts; textures that move move nothing. What moves is
-priced where it is when the vehicle comes there.
+The vehicle knows the geometry and moves on a lattice of `LATTICE_M` by steps ahead or 45 degrees to a side.
+Each place has a price, which falls with its clearance. The geometry is the scene's sections at the vehicle's
+height: of bodies (of a gate, its posts) and of the surfaces of a mesh. Moving textures do not count. A moving
+body is priced at the place where it will be when the vehicle gets there.
 """
 
 import math
@@ -19,10 +19,10 @@ from envs.scene.obstacles import OBSTACLE, body_sections
 from envs.scene.scene import Scene
 
 LATTICE_M = 0.25
-CLEARANCE_SCALE_M = 0.4  # the price of a place falls by e with each such distance from contact
-FELT_M = 6 * CLEARANCE_SCALE_M  # beyond this distance from contact an obstacle adds nothing
-BLOCKED = 1e3
-SIDE_PRICE = 0.01  # of a lattice step to the side: of two free paths, the straighter
+CLEARANCE_SCALE_M = 0.4  # the price of a place falls by a factor e over this distance from contact
+FELT_M = 6 * CLEARANCE_SCALE_M  # an obstacle farther than this from contact adds nothing
+BLOCKED = 1e3  # price of a place in contact
+SIDE_PRICE = 0.01  # of a lattice step to the side, so that the straighter of two free paths wins
 
 
 @dataclass(frozen=True)
@@ -31,8 +31,8 @@ class CostToGo:
 
     Attributes:
         costs: (rows in y, columns in x), float64; row 0 is y = 0.
-        prices: Of being at each place, of the same shape.
-        first_x_m: Where column 0 is [m].
+        prices: Price of being at each place, of the same shape.
+        first_x_m: x of column 0 [m].
     """
 
     costs: np.ndarray
@@ -40,15 +40,15 @@ class CostToGo:
     first_x_m: float
 
     def of_actions(self, x_m: float, y_m: float, sight_m: float = math.inf) -> np.ndarray:
-        """Return the cost of each action from anywhere: ahead, left, right; float64 (3,).
+        """Return the cost of each action at a place: ahead, left, right; float64 (3,).
 
-        A lattice step in the action's direction, and from there the cheapest way, interpolated between
-        the four nearest places; outside the lattice, as at its edge.
+        The cost is that of a lattice step in the action's direction and of the cheapest way from there,
+        interpolated between the four nearest places. Outside the lattice the values at its edge count.
 
         Args:
-            x_m: The place, to the right [m].
-            y_m: And ahead [m].
-            sight_m: Ways end so far ahead, whatever stands behind; infinite: at the goal line [m].
+            x_m: x of the place [m].
+            y_m: y of the place [m].
+            sight_m: Distance ahead at which ways end, whatever stands behind [m]; infinite: at the goal line.
         """
         column, row, ahead = (x_m - self.first_x_m) / LATTICE_M, y_m / LATTICE_M, sight_m / LATTICE_M
         if ahead >= len(self.costs):
@@ -58,7 +58,7 @@ class CostToGo:
     def among(
         self, moving: Sequence[MovingBody], now: tuple[float, float], vehicle: tuple[float, float, float]
     ) -> "CostToGo":
-        """Return the plan among what moves; arguments as `prices_among`."""
+        """Return the plan with moving bodies added; arguments as for `prices_among`."""
         if not moving:
             return self
         prices = prices_among(moving, self.prices, self.first_x_m, now, vehicle)
@@ -66,7 +66,7 @@ class CostToGo:
 
 
 def cost_to_go(scene: Scene, radius_m: float, height_m: float = 2.0, through_x_m: float = 0.0) -> CostToGo:
-    """Plan for a vehicle of `radius_m` at `height_m` [m]; a column of the lattice is at `through_x_m` [m].
+    """Plan for a vehicle of `radius_m` at `height_m` [m]; one lattice column is at x = `through_x_m` [m].
 
     Raises:
         ValueError: The lane is too narrow for the vehicle.
@@ -78,21 +78,21 @@ def cost_to_go(scene: Scene, radius_m: float, height_m: float = 2.0, through_x_m
 
 
 def passable_among(scene: Scene, radius_m: float, height_m: float, speed_mps: float) -> bool:
-    """Whether the planner finds a way from every start among what stands and what moves from time 0 on.
+    """Whether the planner finds a way from every start among standing and moving bodies from time 0 on.
 
-    Balls that are thrown do not count. As the planner, it takes a vehicle to be at each row when it would be
-    straight ahead, so a way is no proof for one that turns much.
+    Thrown balls do not count. Like the planner, it assumes that the vehicle reaches each row when it would by
+    flying straight ahead, so True is no proof for a vehicle that turns much.
 
     Args:
         scene: The corridor.
-        radius_m: Of the vehicle [m].
-        height_m: At which it flies [m].
-        speed_mps: At which it flies [m/s].
+        radius_m: Radius of the vehicle [m].
+        height_m: Height of the vehicle [m].
+        speed_mps: Speed of the vehicle [m/s].
     """
     vehicle = radius_m, height_m, speed_mps
     plan = cost_to_go(scene, radius_m, height_m).among(scene.moving, (0.0, 0.0), vehicle)
     first, last = ((x_m - plan.first_x_m) / LATTICE_M for x_m in scene.spawn_range_m)
-    costs = _costs(np.where(plan.prices >= BLOCKED, BLOCKED, 0.0))  # long ways among others cost much, too
+    costs = _costs(np.where(plan.prices >= BLOCKED, BLOCKED, 0.0))  # clearance prices may add up to BLOCKED
     return bool((costs[0, max(0, math.floor(first)) : math.ceil(last) + 1] < BLOCKED).all())
 
 
@@ -101,8 +101,8 @@ def lattice_prices(
 ) -> tuple[np.ndarray, float]:
     """Return the price of each place of the lattice, (rows in y, columns in x), and column 0's x [m].
 
-    A place in contact costs `BLOCKED`; others less, the farther they are from contact. The outermost
-    columns are in contact with the walls, or farther away than the vehicle can come.
+    A place in contact costs `BLOCKED`; other places cost less the farther they are from contact. The
+    outermost columns are in contact with the walls, or out of the vehicle's reach.
     """
     half = 0.5 * scene.width_m - radius_m
     wide = min(half, max(map(abs, scene.spawn_range_m)) + scene.length_m)
@@ -122,14 +122,14 @@ def prices_among(
     now: tuple[float, float],
     vehicle: tuple[float, float, float],
 ) -> np.ndarray:
-    """Return the prices of `lattice_prices` where bodies move as well.
+    """Return the prices of `lattice_prices` with moving bodies added.
 
     Args:
-        moving: Each row is priced as it is when the vehicle comes there, straight ahead.
-        prices: Of what stands still.
-        first_x_m: Where column 0 is [m].
-        now: The time [s], and where the vehicle is, y [m].
-        vehicle: Its radius [m], height [m] and speed [m/s].
+        moving: The moving bodies; each row is priced at the time when the vehicle would get there straight.
+        prices: Prices without moving bodies.
+        first_x_m: x of column 0 [m].
+        now: The time [s] and the vehicle's y [m].
+        vehicle: Radius [m], height [m] and speed [m/s] of the vehicle.
     """
     radius_m, height_m, speed_mps = vehicle
     y_m, x_m = (LATTICE_M * np.arange(size) for size in prices.shape)
@@ -138,7 +138,7 @@ def prices_among(
         reach_m = max(float(one.body["rx"]), float(one.body["ry"])) + radius_m + FELT_M
         first_m = max(one.places_m[:, 1].min() - reach_m, now[1] - LATTICE_M)
         last_m = one.places_m[:, 1].max() + reach_m
-        rows = slice(*np.searchsorted(y_m, (first_m, last_m)))  # others are behind, or it never comes near
+        rows = slice(*np.searchsorted(y_m, (first_m, last_m)))  # other rows are behind, or always far from it
         bodies = np.array([one.body] * len(y_m[rows]), OBSTACLE)
         bodies["x"], bodies["y"], bodies["z"] = one.places(times_s[rows]).T
         there = (np.abs(bodies["z"] - height_m) <= bodies["rz"]) & (
@@ -158,7 +158,7 @@ def prices_among(
 def _approach(
     clearance: np.ndarray, sections: np.ndarray, x_m: np.ndarray, y_m: np.ndarray, radius: float, reach: float
 ) -> None:
-    """Lower the clearance of places, in rows up to `reach` from a section, to the distance from it."""
+    """Lower the clearance of the places in rows within `reach` of a section to their distance from it."""
     for k in range(len(sections)):
         x, y, ux, uy, hx, hy, r = sections[k]
         size = r + radius
@@ -176,7 +176,7 @@ def _approach(
 
 @numba.njit(cache=True, error_model="numpy")
 def _costs(prices: np.ndarray) -> np.ndarray:
-    """Return the least sum of prices to the last row; each step to a side adds `SIDE_PRICE`."""
+    """Return the smallest sum of prices to the last row; each step to a side adds `SIDE_PRICE`."""
     costs = prices.copy()
     rows, columns = prices.shape
     for j in range(rows - 2, -1, -1):
@@ -192,7 +192,7 @@ def _costs(prices: np.ndarray) -> np.ndarray:
 
 @numba.njit(cache=True, error_model="numpy")
 def _of_actions(costs: np.ndarray, column: float, row: float) -> np.ndarray:
-    """Return `CostToGo.of_actions` of a place in lattice steps."""
+    """Return `CostToGo.of_actions` for a place given in lattice steps."""
     last_row, last_column = costs.shape[0] - 1, costs.shape[1] - 1
     y = min(max(row + 1.0, 0.0), float(last_row))
     j = min(int(y), last_row - 1)
@@ -208,10 +208,10 @@ def _of_actions(costs: np.ndarray, column: float, row: float) -> np.ndarray:
 
 @numba.njit(cache=True, error_model="numpy")
 def _of_actions_in_sight(prices: np.ndarray, column: float, row: float, rows_ahead: int) -> np.ndarray:
-    """`_of_actions` of ways that end `rows_ahead` rows after the next.
+    """Return `_of_actions` for ways that end `rows_ahead` rows after the next row.
 
-    Only the places that such a way can come to are priced, and as many at each side that what lies beyond
-    cannot be felt.
+    Only the places that such a way can reach are priced, with enough columns at each side that the edge has
+    no effect.
     """
     rows, columns = prices.shape
     first = min(int(min(max(row + 1.0, 0.0), rows - 1.0)), rows - 2)

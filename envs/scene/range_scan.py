@@ -1,7 +1,7 @@
 """Range scan: proximity of the first obstacle in each direction, the ground truth of probes.
 
-A ray is the way of a point, and ends where that point first touches a section
-(`envs.scene.collision`): exact for every kind of body and for meshes.
+A ray is the path of a point that ends at its first contact with a section (`envs.scene.collision`).
+It is exact for every kind of body and for meshes.
 """
 
 import math
@@ -13,20 +13,20 @@ from envs.scene.collision import first_contact
 from envs.scene.scene import Scene
 
 MAX_RANGE_M = 100.0  # obstacles farther away count as none
-RAYS = 8  # of a sector: at 90 degrees and 24 sectors no pole of 0.2 m is missed at 20 m
-NEAR_M = 10.0  # proximity falls by e with each such distance: half a second of flight at 20 m/s
+RAYS = 8  # per sector: at 90 degrees and 24 sectors no pole of 0.2 m is missed at 20 m
+NEAR_M = 10.0  # proximity falls by a factor e over this distance: half a second of flight at 20 m/s
 
 
 def proximity(scene: Scene, pose: tuple[float, float, float, float], bearings_rad: np.ndarray) -> np.ndarray:
     """Return the proximity of the first obstacle in each bearing: exp(-distance / NEAR_M), 0 if none.
 
-    The exponential keeps the measure in [0, 1] and lets what is too far to matter weigh
-    nothing: at 30 m it is 0.05, where 1 / (1 + distance / 5 m) is still 0.14.
+    The exponential is in [0, 1] and gives distant obstacles little weight: at 30 m it is 0.05, whereas
+    1 / (1 + distance / 5 m) is still 0.14.
 
     Args:
-        scene: The corridor; its walls are no obstacles here.
-        pose: x, y, z [m] and yaw [rad], as of `CorridorEnv.camera_pose`; rays are level, at height z.
-        bearings_rad: (K,) to the right of straight ahead [rad].
+        scene: The corridor; its walls do not count as obstacles here.
+        pose: x, y, z [m] and yaw [rad], as `CorridorEnv.camera_pose` returns; rays are level, at height z.
+        bearings_rad: (K,) bearings, to the right of straight ahead [rad].
 
     Returns:
         float64 (K,) in [0, 1]; 1 inside an obstacle.
@@ -47,13 +47,13 @@ def sector_proximity(
     """Return the proximity of the nearest obstacle in equal sectors of the field of view, from left to right.
 
     Args:
-        scene: As of `proximity`.
-        pose: As of `proximity`.
+        scene: As for `proximity`.
+        pose: As for `proximity`.
         fov_deg: Horizontal field of view [degrees].
-        sectors: Parts of it.
+        sectors: Number of sectors.
 
     Returns:
-        float64 (sectors,) in [0, 1], by `RAYS` rays in each.
+        float64 (sectors,) in [0, 1], from `RAYS` rays in each.
     """
     bearings = sector_bearings(fov_deg, sectors, RAYS)
     return proximity(scene, pose, bearings.ravel()).reshape(bearings.shape).max(axis=1)
@@ -64,8 +64,8 @@ def sector_bearings(fov_deg: float, sectors: int, rays: int = 1) -> np.ndarray:
 
     Args:
         fov_deg: Horizontal field of view [degrees].
-        sectors: Equal parts of it.
-        rays: In each part, each in the middle of its share.
+        sectors: Number of equal parts of the field of view.
+        rays: Number of rays in each sector, each in the middle of its share.
 
     Returns:
         float64 (sectors, rays) [rad].

@@ -1,12 +1,12 @@
-"""One corridor: obstacles, walls, ground and mesh as plain arrays, their light and their collisions.
+"""One corridor: obstacles, walls, ground and mesh as plain arrays, with their lighting and collisions.
 
 x points right, y forward along the lane, z up; metres throughout. Luminance is linear, in
 [0, 1], and Lambertian: albedo * (ambient + diffuse * max(0, normal . sun)). The ground is
-an infinite plane at z = 0; the walls are two upright planes at x = +-width_m / 2, both
-sides of which can be seen.
+an infinite plane at z = 0; the walls are two upright planes at x = +-width_m / 2, visible
+from both sides.
 
-A vehicle is a level disc at the height at which it flies. It touches what the plane at that
-height cuts from the bodies and from the surfaces of a mesh, and the walls at any height.
+A vehicle is a level disc at its flight height. It collides with the sections of bodies and
+mesh surfaces at that height, and with the walls at any height.
 """
 
 import dataclasses
@@ -40,33 +40,33 @@ from envs.scene.paths import bodies_at
 from envs.scene.spheres import is_sphere_path, moving_spheres, sphere_obstacles
 from envs.scene.textures import Texture
 
-# The sun stands behind the start and to the right, so that the sides of a pole differ.
+# The sun stands behind the start and to the right, so that the sides of a pole differ in brightness.
 SUN = (0.4, -0.5, math.sqrt(0.59))
-MAX_DRAWS = 20  # of corridors, until one is passable
-MAX_HEIGHTS = 8  # for which a scene caches its sections
+MAX_DRAWS = 20  # corridors drawn until one is passable
+MAX_HEIGHTS = 8  # heights for which a scene caches its sections
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """One corridor, immutable: what stands where and how bright it is.
+    """One corridor, immutable: its bodies, their places and their brightness.
 
     Attributes:
-        name: Layout it was made from.
+        name: Name of its layout or file.
         obstacles: (N,) OBSTACLE, read-only.
         length_m: The goal line is at y = length_m [m].
         width_m: The walls are at x = +-width_m / 2 [m].
         wall_height_m: Top of the walls [m].
-        walls_y_m: Where the walls begin and end in y [m]; collisions take them as endless.
+        walls_y_m: Range of y of the walls [m]; for collisions they are endless.
         spawn_range_m: Range of x at the start, y = 0 [m] (appendix D.1).
         ground_albedo, wall_albedo: In [0, 1].
-        sky_luminance: Everything above the horizon that nothing hides.
+        sky_luminance: Luminance above the horizon where nothing hides the sky.
         ambient, diffuse: Lambert weights.
         sun: Unit vector towards the sun.
         ground_texture, wall_texture, obstacle_texture: See `envs.scene.textures`.
         mesh: More surfaces, as vertices (V, 3) [m], faces (F, 3) counter-clockwise seen from
-            outside, and baked luminance (V,); only pyrender draws them. None: nothing more.
-        moving: Bodies that move, which only the ray caster draws.
-        throws: Balls that are thrown at the vehicle; None: none is.
+            outside, and baked luminance (V,); only pyrender draws them. None: no mesh.
+        moving: Bodies that move; only the ray caster draws them.
+        throws: Balls that are thrown at the vehicle; None: no balls.
     """
 
     name: str
@@ -103,13 +103,13 @@ class Scene:
 
     @cached_property
     def kinds(self) -> frozenset[int]:
-        """Kinds of obstacles that are there, standing or moving: POLE, CONE, ELLIPSOID, BOX."""
+        """Kinds of the obstacles in the scene, standing or moving: POLE, CONE, ELLIPSOID, BOX."""
         moving = {int(one.body["kind"]) for one in self.movers}
         return frozenset(np.unique(self.obstacles["kind"]).tolist()) | moving
 
     @property
     def movers(self) -> tuple[MovingBody, ...]:
-        """Bodies that move, and last the ball that is thrown, if any."""
+        """Bodies that move; if balls are thrown, the ball comes last."""
         return self.moving if self.throws is None else (*self.moving, self.throws.waiting())
 
     @cached_property
@@ -117,7 +117,7 @@ class Scene:
         return {}
 
     def sections(self, height_m: float = 2.0) -> np.ndarray:
-        """Return the sections that a vehicle at `height_m` [m] can hit, without walls; cached.
+        """Return the sections that a vehicle at `height_m` [m] can hit, without the walls; cached.
 
         Returns:
             (M, 7) float64, read-only; see `envs.scene.obstacles`.
@@ -137,28 +137,28 @@ class Scene:
     def shade(self, albedo: Any, normals: Any) -> np.ndarray:
         """Return the Lambertian luminance of surfaces of `albedo` (...,) with `normals` (..., 3); float64.
 
-        Without BLAS, which rounds by the number of threads.
+        It does not use BLAS, whose rounding depends on the number of threads.
         """
         towards_sun = np.maximum(0.0, (np.asarray(normals, np.float64) * np.asarray(self.sun)).sum(axis=-1))
         return np.asarray(albedo, np.float64) * (self.ambient + self.diffuse * towards_sun)
 
     def first_contact(self, a_m: Any, b_m: Any, radius_m: float, height_m: float = 2.0) -> float:
-        """Return where a level disc of `radius_m` moving from `a_m` to `b_m` (x, y) [m] first has contact.
+        """Return the fraction of the way from `a_m` to `b_m` at which a level disc first has contact.
 
-        Touching counts as contact; a start in contact gives 0. Exact for any length. A body
-        is solid; a mesh is its surfaces, so inside one there is no contact until one is reached.
+        Touching counts as contact; a start in contact gives 0. The result is exact for any length. Bodies
+        are solid. A mesh is only its surfaces, so a disc inside a mesh has no contact until it reaches one.
 
         Args:
-            a_m: Where the way begins, x and y [m].
-            b_m: Where it ends.
+            a_m: Start of the way, x and y [m].
+            b_m: End of the way, x and y [m].
             radius_m: Radius of the disc [m].
-            height_m: Height at which it flies [m].
+            height_m: Height of the disc [m].
 
         Returns:
             Fraction in [0, 1] of the segment, or inf if there is no contact.
 
         Raises:
-            ValueError: If a number is not finite, or the radius is negative.
+            ValueError: A number is not finite, or the radius is negative.
         """
         ax, ay, bx, by = float(a_m[0]), float(a_m[1]), float(b_m[0]), float(b_m[1])
         if not (math.isfinite(ax + ay + bx + by + height_m) and 0.0 <= radius_m < math.inf):
@@ -169,27 +169,27 @@ class Scene:
         return first_contact((ax, ay, bx, by), radius_m, 0.5 * self.width_m, self.sections(height_m))
 
     def collides(self, a_m: Any, b_m: Any, radius_m: float, height_m: float = 2.0) -> bool:
-        """Whether a disc of `radius_m` touches anything on its way from `a_m` to `b_m` (x, y) [m]."""
+        """Whether a disc of `radius_m` touches anything on the way from `a_m` to `b_m` (x, y) [m]."""
         return self.first_contact(a_m, b_m, radius_m, height_m) <= 1.0
 
     def ways_to_goal(self, radius_m: float, height_m: float = 2.0) -> np.ndarray:
         """Find the cells of `collision.CELL_M` from which the vehicle can reach the goal line.
 
-        True is a proof for a vehicle whose steps are short against a cell; see
+        True is a proof for a vehicle whose steps are short compared with a cell; see
         `envs.scene.collision.ways_to_goal`.
 
         Returns:
-            bool (rows, 2 * n + 3), whose place [j, n + 1 + i] is x = i cells, y = j cells.
+            bool (rows, 2 * n + 3); element [j, n + 1 + i] is at x = i cells, y = j cells.
         """
         far = max(map(abs, self.spawn_range_m)) + self.length_m
         columns = math.ceil(min(0.5 * self.width_m, far) / CELL_M) + 1
         return ways_to_goal(self.sections(height_m), radius_m, 0.5 * self.width_m, self.length_m, columns)
 
     def passable(self, radius_m: float, height_m: float = 2.0) -> bool:
-        """Whether a way to the goal line leads from every start, by steps ahead or 45 degrees to a side.
+        """Whether a path to the goal line exists from every start, by steps ahead or 45 degrees to a side.
 
-        True only if there are such ways, and always if there are some that keep 1.5 cells
-        (0.15 m) more than `radius_m` from everything.
+        True only if there are such paths. Always True if some paths stay at least `radius_m` plus 1.5 cells
+        (0.15 m) away from everything.
         """
         starts = self.ways_to_goal(radius_m, height_m)[0]
         middle = (len(starts) - 1) // 2
@@ -208,21 +208,21 @@ def make_scene(
 ) -> Scene:
     """Draw a scene; the same state of `rng` gives the same bytes.
 
-    The first of up to `MAX_DRAWS` drawn corridors that is passable is taken. A mesh file
-    leaves nothing to draw.
+    It draws up to `MAX_DRAWS` corridors and returns the first passable one. With a mesh file nothing is
+    random.
 
     Args:
-        name: A key of LAYOUTS, the path of a CSV file of spheres (`envs.scene.spheres`), or that of a mesh
-            file that `trimesh` can read, whose surfaces stand in an otherwise empty lane.
-        rng: Source of all that is random.
+        name: A key of LAYOUTS, the path of a CSV file of spheres (`envs.scene.spheres`), or the path of a
+            mesh file that `trimesh` can read. The mesh stands in an otherwise empty lane.
+        rng: Source of all random draws.
         vehicle_radius_m: Radius of the vehicle that has to get through [m].
-        height_m: Height at which it flies [m].
-        **overrides: Values that replace fields of the layout, such as num_obstacles=60;
-            those of a mesh file are the fields of `MeshLayout`, of a file of spheres of `SphereLayout`.
+        height_m: Height at which the vehicle flies [m].
+        **overrides: Values that replace fields of the layout, such as num_obstacles=60. The layout of a mesh
+            file is a `MeshLayout`, the layout of a file of spheres a `SphereLayout`.
 
     Raises:
-        ValueError: If the name, an override or its value is not valid, if the obstacles
-            cannot be placed `min_gap_m` apart, or if no corridor was passable.
+        ValueError: The name, an override or its value is not valid, the obstacles cannot be placed
+            `min_gap_m` apart, or no corridor was passable.
     """
     if not (math.isfinite(height_m) and 0.0 <= vehicle_radius_m < math.inf):
         raise ValueError(
@@ -289,7 +289,7 @@ def _mesh_corridor(name: str, layout: MeshLayout) -> Scene:
 
 @functools.lru_cache(maxsize=2)
 def _read_mesh_corridor(name: str, stamp: tuple[int, int], layout: MeshLayout) -> Scene:
-    """Return the scene of a mesh file, read once for all episodes; `stamp` changes with the file."""
+    """Return the scene of a mesh file, cached for all episodes; `stamp` changes with the file."""
     corners, normals, albedo = read_mesh(layout.file)
     nothing = np.empty(0, bodies.OBSTACLE)
     bare = Scene(name, nothing, width_m=layout.width_m, wall_height_m=layout.wall_height_m)

@@ -1,12 +1,12 @@
 """Worlds of spheres: the obstacle files of the ICRA 2022 DodgeDrone challenge, and its generator.
 
 A row of such a file is `prefab, x, y, z, qw, qx, qy, qz, sx, sy, sz`: the centre [m], x forward, y to the
-left and z up; the rotation, which a sphere does not show; and the scale, equal in all directions, whose
-half is the radius. A sphere at 1000, 1000, 1000 was removed, because it stood in an exclusion zone. Here y
+left and z up; the rotation, which does not matter for a sphere; and the scale, equal in all directions and
+twice the radius. A sphere at 1000, 1000, 1000 has been removed, because it was in an exclusion zone. Here y
 is forward and x to the right.
 
-Spheres may overlap each other and the ground. The ray caster assumes that bodies do not: of two that
-overlap it draws the nearer one whole, and of one in the ground its lower part too. `about` counts both.
+Spheres may overlap each other and the ground. The ray caster assumes that bodies do not: of two overlapping
+spheres it draws the nearer one whole, and of a sphere in the ground also the lower part. `about` counts both.
 """
 
 import csv
@@ -24,24 +24,24 @@ from envs.scene.obstacles import ELLIPSOID, OBSTACLE
 
 REMOVED_M = 1000.0
 COLUMNS = ("prefab", "x", "y", "z", "qw", "qx", "qy", "qz", "sx", "sy", "sz")
-ALBEDO = 0.25  # that of poles
-STRAIGHT_M = 1e-9  # by which a place may leave the line between its neighbours
+ALBEDO = 0.25  # the same as poles
+STRAIGHT_M = 1e-9  # largest deviation of a place from the line between its neighbours
 MAX_SPHERES = 100_000
-# Of the challenge's final generator: spheres per square metre of ground, from x to x [m], 20 m wide.
+# Regions of the challenge's final generator, 20 m wide: spheres per square metre, first and last x [m].
 REGIONS = ((0.11, 0.0, 60.0), (0.21, 0.0, 60.0), (0.21, 40.0, 60.0))
 RADII_M = (0.05, 1.5)
 HALF_WIDTH_M, TOP_M = 10.0, 10.0
-ZONES = ((-3.0, 3.0), (57.0, 61.0))  # of takeoff and goal: no sphere within 3 m of the middle, below 5 m
+ZONES = ((-3.0, 3.0), (57.0, 61.0))  # at takeoff and goal: no sphere within 3 m of the middle, below 5 m
 ZONE_HALF_M, ZONE_TOP_M = 3.0, 5.0
 
 
 class About(NamedTuple):
-    """What the ray caster does not draw as it is.
+    """Number of spheres, and number of spheres that the ray caster does not draw correctly.
 
     Attributes:
-        spheres: How many there are.
-        overlaps: Pairs of spheres that overlap.
-        in_ground: Spheres that the ground cuts.
+        spheres: Number of spheres.
+        overlaps: Number of pairs of spheres that overlap.
+        in_ground: Number of spheres that the ground cuts.
     """
 
     spheres: int
@@ -55,7 +55,7 @@ def is_sphere_path(name: str) -> bool:
 
 
 def sphere_obstacles(layout: SphereLayout, rng: np.random.Generator) -> np.ndarray:
-    """Return the spheres of a layout's file, or draw them.
+    """Return the spheres of a layout's file, or draw spheres if it has none.
 
     Raises:
         ValueError: The file cannot be read, or breaks a rule; the message names the line.
@@ -88,7 +88,7 @@ def read_spheres(path: str, stamp: tuple[int, int]) -> np.ndarray:
 
 
 def _sphere(path: str, number: int, row: Sequence[str]) -> tuple[float, ...] | None:
-    """Return one row as the values of an OBSTACLE; None if it was removed."""
+    """Return one row as the values of an OBSTACLE; None if the sphere was removed."""
     where = f"scene {path!r}, line {number}"
     if len(row) != len(COLUMNS):
         raise ValueError(f"{where}: must have the {len(COLUMNS)} values {', '.join(COLUMNS)}, got {len(row)}")
@@ -109,10 +109,10 @@ def _sphere(path: str, number: int, row: Sequence[str]) -> tuple[float, ...] | N
 
 
 def moving_spheres(layout: SphereLayout) -> tuple[MovingBody, ...]:
-    """Return the spheres that move, of `dynamic_obstacles.yaml` beside the layout's file.
+    """Return the moving spheres of `dynamic_obstacles.yaml` in the folder of the layout's file.
 
-    Each has a scale and the name of a file in `csvtrajs`, whose rows behind a heading are t, x, y, z and the
-    rotation, every 20 ms. A sphere rests when its file ends, unless it loops.
+    Each sphere has a scale and the name of a file in `csvtrajs`. Below a heading, the rows of that file are
+    t, x, y, z and the rotation, every 20 ms. When the file ends, the sphere rests, unless it loops.
 
     Raises:
         ValueError: A file is missing, or breaks a rule.
@@ -154,7 +154,7 @@ def _moving(path: str, name: str, said: dict[str, Any]) -> MovingBody:
     if not min(scales) > 0.0 or max(scales) - min(scales) > 1e-6 * max(scales):
         raise ValueError(f"scene {path!r}, {name}: scale must be equal in all directions and above 0")
     radius, places = 0.5 * scales[0], np.stack([-rows[:, 2], rows[:, 1], rows[:, 3]], axis=1)
-    bends = np.ones(len(rows), bool)  # of a path at constant velocity both ends suffice
+    bends = np.ones(len(rows), bool)  # a stretch at constant velocity needs only its two ends
     bends[1:-1] = np.abs(np.diff(places, 2, axis=0)).max(axis=1, initial=0.0) > STRAIGHT_M
     x, y, z = places[0]
     body = np.array([(ELLIPSOID, x, y, z, radius, radius, radius, ALBEDO)], OBSTACLE)
@@ -162,7 +162,7 @@ def _moving(path: str, name: str, said: dict[str, Any]) -> MovingBody:
 
 
 def drawn_spheres(layout: SphereLayout, rng: np.random.Generator) -> np.ndarray:
-    """Draw the standing spheres of the challenge's generator, `layout.density` times as many."""
+    """Draw `layout.density` times as many standing spheres as the challenge's generator."""
     parts = []
     for density, first_m, last_m in REGIONS:
         area = (last_m - first_m) * 2.0 * HALF_WIDTH_M
@@ -185,7 +185,7 @@ def drawn_spheres(layout: SphereLayout, rng: np.random.Generator) -> np.ndarray:
 
 
 def about(spheres: np.ndarray) -> About:
-    """Count what the ray caster does not draw as it is; of (N,) OBSTACLE."""
+    """Count the spheres, (N,) OBSTACLE, and the spheres that the ray caster does not draw correctly."""
     from scipy.spatial import cKDTree
 
     places = np.stack([spheres[name] for name in "xyz"], axis=1)

@@ -7,7 +7,7 @@ P is the pattern, in [-1, 1], and (s, q) are surface coordinates in metres:
 - walls and the sides of boxes that face x: (y, z); those that face y: (x, z)
 - poles, cones and ellipsoids: (x0 + k * azimuth, y0 + z), with the azimuth
   atan2(y - y0, x - x0) around their axis (x0, y0), and k such that a whole number of
-  periods (of tiles, for noise) closest to the circumference goes around
+  periods (of tiles, for noise) fits around the body, as near to its circumference as possible
 """
 
 import functools
@@ -18,8 +18,8 @@ import numpy as np
 
 PLAIN, CHECKER, STRIPES, RINGS, NOISE = range(5)
 PATTERNS = ("plain", "checker", "stripes", "rings", "noise")
-TILE_PERIODS = 4  # the noise repeats after so many periods along both axes
-TILE = 256  # texels of the noise along either axis of its tile
+TILE_PERIODS = 4  # periods along each axis after which the noise repeats
+TILE = 256  # texels along each axis of the noise's tile
 
 
 @dataclass(frozen=True)
@@ -31,8 +31,8 @@ class Texture:
             s. "rings": +-1 along q. "noise": a sum of waves between 1 and 2 periods long.
         period_m: Length of one period along either axis [m].
         contrast: Depth of the pattern, in [0, 1].
-        velocity_mps: How fast the pattern moves along s and q [m/s].
-        seed: Of the noise.
+        velocity_mps: Velocity of the pattern along s and q [m/s].
+        seed: Seed of the noise.
     """
 
     pattern: str = "plain"
@@ -76,7 +76,7 @@ def around(texture: Texture, radius_m: float) -> float:
     """Return the metres of surface coordinate per radian around a round body, so that the pattern closes.
 
     Args:
-        texture: What goes around.
+        texture: The texture.
         radius_m: Largest radius of the body [m].
     """
     repeat = texture.period_m * (TILE_PERIODS if texture.pattern == "noise" else 1)
@@ -87,8 +87,8 @@ def around(texture: Texture, radius_m: float) -> float:
 def noise_waves(seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the waves of the noise: cycles per tile along (s, q), (M, 2), and complex amplitudes (M,).
 
-    P(s, q) = Re sum of amplitude * exp(2 pi i (a s + b q)), s and q in tiles. All waves of a
-    half-plane between TILE_PERIODS / 2 and TILE_PERIODS cycles long, equally strong, with
+    P(s, q) = Re sum of amplitude * exp(2 pi i (a s + b q)), s and q in tiles. These are all waves
+    of a half-plane with TILE_PERIODS / 2 to TILE_PERIODS cycles a tile, equally strong, with
     random phases; the largest |P| among the texels is 1.
     """
     span = range(-TILE_PERIODS, TILE_PERIODS + 1)
@@ -103,7 +103,7 @@ def noise_waves(seed: int) -> tuple[np.ndarray, np.ndarray]:
 def _sum_waves(cycles: np.ndarray, amplitudes: np.ndarray, size: int) -> np.ndarray:
     """Return the sum of the waves at the texels, (size, size) float64, q along rows and s along columns.
 
-    Wave by wave: BLAS would round a product of matrices by the number of threads and the processor.
+    It adds wave by wave, because the rounding of BLAS depends on the number of threads and the processor.
     """
     turns = 2j * math.pi / size * np.arange(size)
     along_s, along_q = np.exp(np.outer(cycles[:, 0], turns)), np.exp(np.outer(cycles[:, 1], turns))
@@ -116,7 +116,7 @@ def _sum_waves(cycles: np.ndarray, amplitudes: np.ndarray, size: int) -> np.ndar
 
 @functools.cache
 def noise_tile(seed: int) -> np.ndarray:
-    """Return one period of the noise, (TILE, TILE) float32, read-only: tile[j, i] is P at s = i, q = j."""
+    """Return a tile of the noise, (TILE, TILE) float32, read-only: tile[j, i] is P at s = i, q = j texels."""
     tile = _sum_waves(*noise_waves(seed), TILE).astype(np.float32)
     tile.flags.writeable = False
     return tile

@@ -1,6 +1,6 @@
-"""Triangles of a scene with their baked luminance, counter-clockwise seen from outside.
+"""Triangles of a scene with baked luminance, counter-clockwise seen from outside.
 
-Vertices are split where the surface has an edge, so that flat faces are flat and round sides
+Vertices are split at the edges of a surface, so that flat faces are flat and round sides
 smooth. Textures are not baked: the triangles show every surface in its mean luminance.
 """
 
@@ -27,7 +27,7 @@ def to_trimesh(scene: Scene, sections: int = 32) -> "trimesh.Scene":
     in `vertex_attributes["luminance"]`. Textures are not baked: a surface has its mean luminance. The ground
     ends 100 km away.
     """
-    import trimesh  # a heavy import that only this function needs
+    import trimesh  # slow to load; only this function needs it
 
     vertices, faces, luminance = scene_mesh(scene, sections)
     grey = np.clip(np.rint(luminance * 255.0), 0, 255).astype(np.uint8)
@@ -41,9 +41,9 @@ def scene_mesh(scene: Scene, sections: int = 32) -> Part:
     """Return `scene` as one mesh: obstacles, ground, both sides of the walls, its own mesh.
 
     Args:
-        scene: What to triangulate.
-        sections: Corners of a horizontal section of a round body, at least 3. Its mean radius is
-            that of the body; its silhouette is off by up to 0.3 % of the radius at 32.
+        scene: The scene to triangulate.
+        sections: Corners of a horizontal section of a round body, at least 3. The section's mean radius is
+            the body's radius; with 32 corners its silhouette is off by up to 0.3 % of the radius.
 
     Returns:
         Vertices (V, 3) float64 [m], faces (F, 3) int64, luminance (V,) float64. The ground is a
@@ -57,7 +57,7 @@ def scene_mesh(scene: Scene, sections: int = 32) -> Part:
 
 
 def join(parts: list[Part]) -> Part:
-    """Join meshes; no mesh gives an empty one."""
+    """Join meshes; an empty list gives an empty mesh."""
     parts = [(np.zeros((0, 3)), np.zeros((0, 3), np.int64), np.zeros(0)), *parts]
     offsets = np.cumsum([0] + [len(part[0]) for part in parts[:-1]])
     return (
@@ -77,7 +77,7 @@ def body_mesh(scene: Scene, body: np.void, sections: int) -> Part:
         grow = mean_radius(2 * (sections // 2))
         return _lathe(scene, body, np.cos(latitude) * grow, np.sin(latitude) * grow, sections)
     if body["kind"] == CONE:
-        # Rings closer to the apex, because the luminance changes around the axis, not along it.
+        # Rings lie closer near the apex, because the luminance changes around the axis, not along it.
         radii = np.array([1.0, 0.5, 0.25, 0.125, 0.0])
         side = _lathe(scene, body, radii, 1.0 - 2.0 * radii, sections)
         return join([side, _disc(scene, body, -height, sections)])
@@ -116,7 +116,7 @@ def ground_mesh(scene: Scene) -> Part:
 
 
 def wall_meshes(scene: Scene) -> list[Part]:
-    """Return both walls, once for each side, so that back faces can be culled."""
+    """Return each wall twice, once for each side, so that back faces can be culled."""
     near, far = scene.walls_y_m
     height, half = scene.wall_height_m, 0.5 * scene.width_m
     meshes = []
@@ -138,7 +138,7 @@ def _lathe(scene: Scene, body: np.void, radii: np.ndarray, heights: np.ndarray, 
     n, m = sections, len(radii)
     centre = np.array([body["x"], body["y"], body["z"]])
     half = np.array([body["rx"], body["rx"], body["rz"]])
-    # The corners of a ring of no radius lie between those of the others, as its triangles do.
+    # The corners of a ring of radius 0 are turned by half a step, to the middle of their triangles.
     angle = (np.arange(n) + 0.5 * (radii[:, None] < 1e-9)) * (2.0 * math.pi / n)
     across = np.stack([np.cos(angle), np.sin(angle)], axis=2)  # (M, n, 2)
     level = np.broadcast_to(heights[:, None, None], (m, n, 1))
@@ -162,7 +162,7 @@ def _lathe(scene: Scene, body: np.void, radii: np.ndarray, heights: np.ndarray, 
 
 
 def _disc(scene: Scene, body: np.void, height_m: float, sections: int) -> Part:
-    """Return the level face of `body` at `height_m` above its centre: seen from below if that is negative."""
+    """Return the level face of `body` at `height_m` above its centre; a negative height faces down."""
     n = sections
     angle = np.arange(n) * (2.0 * math.pi / n)
     rim = np.stack([np.cos(angle), np.sin(angle), np.zeros(n)], axis=1) * body["rx"] * mean_radius(n)

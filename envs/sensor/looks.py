@@ -1,9 +1,9 @@
-"""One control step of a camera that looks at columns when something changes in them.
+"""Simulate one control step of a camera by looks: renders of single columns when something changes in them.
 
-The whole image is rendered at the end of each part of the way. Before that, a column is looked
-at when the silhouette of a body enters or leaves it, once half-way where one moves fast, and as
-often as outlines in it move far: what is distant moves little and is not looked at again. The
-light of a pixel is linear in time between, so far fewer renders give the same events.
+The whole image is rendered at the end of each part of the way. Before that, a column is rendered when a
+body's silhouette enters or leaves it, once half-way if a silhouette moves fast in it, and more often the
+farther its outlines move. Distant bodies move little, so their columns need no extra look. Between two
+looks a pixel's light is taken as linear in time, so far fewer renders give the same events.
 """
 
 from functools import lru_cache
@@ -34,21 +34,21 @@ from envs.raycast.silhouettes import (
 from envs.raycast.stretches import Outlines, Shifts, divide_time, find_rows, make_outlines
 
 BAD_POSE = -2
-ROOM = 8  # images whose pixels can all fire, before only the last one of a part is looked at
+ROOM = 8  # [images]: ramps for this many images of firing pixels; then only the end of a part is rendered
 
 
 class Scratch(NamedTuple):
-    """Room for one step of one camera, which all cameras of a process with images of this size share.
+    """Scratch arrays for one step of one camera, shared by all cameras of a process with this image size.
 
     Attributes:
-        room: `Workspace` for as many bodies as a scene has, or more.
-        near: BODY, as many: those that can be in view on a way.
-        columns: float32 (W, H), what is painted, column after column.
-        pixels: As `crossings.steps` takes its scratch.
-        ramps: For `ROOM` times as many pixels as the image has.
-        looks: For the looks at it.
-        outlines: For those of the bodies.
-        block: For a block of pixels.
+        room: `Workspace` for at least as many bodies as the scene has.
+        near: (N,) BODY, room for the bodies that can be in view on a way.
+        columns: float32 (W, H), the rendered image, column after column.
+        pixels: The scratch of `crossings.steps`.
+        ramps: Room for `ROOM` ramps per pixel of the image.
+        looks: Room for the looks at the image.
+        outlines: Room for the outlines of the bodies.
+        block: Room for a block of pixels.
     """
 
     room: Workspace
@@ -66,16 +66,17 @@ class View(NamedTuple):
 
     Attributes:
         bodies: (N,) BODY, the obstacles.
-        noise: Of the scene.
-        frame: (1,) FRAME without what a pose determines.
+        noise: Noise textures of the scene.
+        frame: (1,) FRAME without the fields that depend on the pose.
         cull_m: Obstacles farther than this are not drawn [m].
-        model: The model of a `ColumnCamera`, as its `state` gives it.
-        memory: Its memory; the last image is a part of it, behind a filter as it is seen there.
-        seen_us: int64 (W,), when each column was looked at last [us].
-        bandwidth: Of its photoreceptors.
-        shifts: How far outlines may move between two looks.
-        flicker: How the scene's light flickers.
-        scratch: Room for a step.
+        model: Model of a `ColumnCamera`, as in its `state`.
+        memory: Memory of the camera, including the last image (as filtered by the photoreceptors, if they
+            limit the bandwidth).
+        seen_us: int64 (W,), time of the last look at each column [us].
+        bandwidth: Bandwidth of the photoreceptors.
+        shifts: Largest motion of outlines between two looks.
+        flicker: Flicker of the scene's light.
+        scratch: Scratch for a step.
     """
 
     bodies: np.ndarray
@@ -92,13 +93,13 @@ class View(NamedTuple):
 
 
 def scratch_for(width: int, height: int, num_bodies: int) -> Scratch:
-    """Return scratch for images of `width` x `height` pixels of a scene of `num_bodies` bodies."""
+    """Return scratch for images of `width` x `height` pixels and scenes of `num_bodies` bodies."""
     return _scratch(width, height, 1 << (num_bodies - 1).bit_length())
 
 
 @lru_cache(maxsize=4)
 def _scratch(width: int, height: int, num_bodies: int) -> Scratch:
-    """Allocate one scratch per size: scenes share it, so it stays in the processor's cache."""
+    """Allocate one scratch per size; scenes share it, so that it stays in the processor's cache."""
     size, words = width * height, (width * height + 7) // 8
     return Scratch(
         room=make_workspace(num_bodies, height),
@@ -117,13 +118,14 @@ def sense_way(view, way, parts):
     """Simulate the camera along a way.
 
     Args:
-        view: `View`, whose last image becomes that at the end.
+        view: `View`; its last image becomes the image at the end of the way.
         way: `Way`.
-        parts: In how many parts of equal time the way is cut; in more if the light flickers faster, and for
-            columns in which something is near.
+        parts: Number of parts of equal time into which the way is cut. There are more if the light flickers
+            faster, and more looks at columns in which something is near.
 
     Returns:
-        First invalid pixel, -1 or BAD_POSE; events lost; columns looked at; EVENT array, sorted.
+        First invalid pixel, -1 (all valid) or BAD_POSE; number of events lost; number of columns rendered;
+        sorted EVENT array.
     """
     bodies, scratch, outlines = view.bodies, view.scratch, view.scratch.outlines
     model, memory = named(view.model, view.memory)
@@ -131,7 +133,7 @@ def sense_way(view, way, parts):
     scratch.room.frames[0] = view.frame[0]
     if not _is_near(way):
         return BAD_POSE, 0, 0, np.empty(0, EVENT)
-    for column in range(view.seen_us.size):  # nothing was seen while the camera stood still
+    for column in range(view.seen_us.size):  # nothing changed while the camera stood still
         view.seen_us[column] = max(view.seen_us[column], way.start_us)
     parts = min(max(parts, looks_needed(view.flicker, way.moving_us)), way.moving_us)
     count, stretches = _divide(view, way, parts)
@@ -139,11 +141,11 @@ def sense_way(view, way, parts):
     near = near[: find_near(bodies, way, frame.focal, view.seen_us.size, view.cull_m, near)]
     before, after, followed = outlines.before[:count], outlines.after[:count], outlines.followed[:count]
     events, lost, columns, begun_us = np.empty(0, EVENT), 0, 0, way.start_us
-    kept = np.int64(0)  # not 0, for which numba would compile everything below a second time
+    kept = np.int64(0)  # a plain 0 would make numba compile everything below a second time
     end_us = begun_us
     for number in range(1, parts * stretches + 1):
         begin_us, end_us = end_us, way.start_us + way.moving_us * number // (parts * stretches)
-        if parts * stretches > 1:  # of a way in one stretch, both ends are known
+        if parts * stretches > 1:  # `_divide` has found both ends of a way that is one stretch
             before, after = (after, before) if number > 1 else (before, after)
             aim_along(scratch.room.frames[0], way, end_us)
             find_silhouettes(bodies, followed, view.seen_us.size, scratch.room, after)
@@ -162,11 +164,12 @@ def sense_way(view, way, parts):
 
 @kernel
 def _divide(view, way, parts):
-    """Choose into how many stretches each part of a way is cut.
+    """Choose how many stretches each part of a way is cut into.
+
+    The scratch's outlines become the outlines of the bodies in view at both ends of the way.
 
     Returns:
-        The number of bodies in view, of which the scratch's outlines are those of both ends of the way; and
-        that of stretches.
+        The number of bodies in view and the number of stretches.
     """
     bodies, room, outlines, width = view.bodies, view.scratch.room, view.scratch.outlines, view.seen_us.size
     shifts, frame = _of_part(view.shifts, parts), room.frames[0]
@@ -178,18 +181,18 @@ def _divide(view, way, parts):
     aim_along(frame, way, way.start_us)
     find_silhouettes(bodies, followed, width, room, outlines.before)
     find_rows(bodies, followed, width, way, shifts, room, outlines.rows_before)
-    limit = way.moving_us // parts  # no stretch is shorter than the clock's microsecond
+    limit = way.moving_us // parts  # a stretch lasts at least one microsecond
     return count, divide_time(bodies, count, outlines, way, frame, shifts, limit, view.scratch.looks)
 
 
 @kernel
 def _look_along(view, near, way, stretch, ends, watch, kept):
-    """Look at the columns that a stretch of a way asks for; at all columns if it `ends` a part of the way.
+    """Render the columns due in a stretch of a way; all columns if the stretch `ends` a part of the way.
 
     `near` are the bodies that can be in view.
 
     Returns:
-        First invalid pixel or -1, ramps in use, events lost, columns looked at.
+        First invalid pixel or -1, number of ramps in use, events lost, columns rendered.
     """
     room, painted, looks = view.scratch.room, view.scratch.columns, view.scratch.looks
     lost = columns = 0
@@ -212,7 +215,7 @@ def _look_along(view, near, way, stretch, ends, watch, kept):
 
 @inlined
 def _dim(painted, first, last, factor):
-    """Multiply columns of an image (W, H) by a factor."""
+    """Multiply columns `first` .. `last` - 1 of an image (W, H) by a factor."""
     for column in range(first, last):
         for row in range(painted.shape[1]):
             painted[column, row] *= factor

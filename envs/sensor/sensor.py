@@ -1,4 +1,4 @@
-"""The vehicle's event camera: renders along the way, finds the events, applies the faults."""
+"""The vehicle's event camera: render along the way, find the events, apply the faults."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -28,41 +28,42 @@ MAX_PIXELS_TOGETHER = 2**22  # pixels rendered before the camera sees them: 16 M
 class Sensor:
     """Renderer, event camera and faults of one vehicle.
 
-    Only what is observed is simulated: with observation "luminance" one render a step and no event
-    camera, with "none" a clock alone.
+    It simulates only what is observed. With observation "luminance" it renders once a step, without an event
+    camera; with "none" it only advances the clock.
 
-    A sensor that sees by looks is not stepped here: the compiled step of `envs.vehicles` takes its `view`,
-    together with the views of many other sensors, and its `faults`; `with_faults` applies what those lack.
+    A sensor with adaptive column rendering (`sees_by_looks`) is not stepped here. The compiled step of
+    `envs.vehicles` takes its `view` and `faults`, together with the views and faults of many other sensors.
+    `with_faults` then applies the faults that the compiled step cannot.
 
     Attributes:
-        events: EVENT array of the last step, faults included; empty where no camera is simulated.
-        true_events: The same before the faults.
-        luminance: float32 (H, W), the last render; by looks, an array that the next step changes.
+        events: EVENT array of the last step, faults included; empty if no event camera is simulated.
+        true_events: The events before the faults.
+        luminance: float32 (H, W), the last render; with `sees_by_looks`, the next step changes this array.
         dropped: Events of the last step lost to the camera's cap and its readout.
-        renders: Renders of the last step.
+        renders: Number of renders in the last step.
         t_us: The simulated clock [us].
-        plan: How the scene is simulated, `envs.fidelity.RenderPlan`.
+        plan: Rendering settings of the scene, `envs.fidelity.RenderPlan`.
     """
 
     def __init__(self, config: EnvConfig, planned: EnvConfig | None = None) -> None:
         """Make the sensor that `config` describes.
 
-        Its renders are planned for the speed and rate of `planned`, which differ from `config` for a vehicle
-        that may fly faster than `config.speed_mps`. None: both are those of `config`.
+        Its renders are planned for the speed and rate of `planned`. These differ from `config` if the vehicle
+        may fly faster than `config.speed_mps`. None: use `config`.
         """
         self._config, self._planned = config, planned or config
-        self._camera: Any = EventCamera(config.camera)  # or a `ColumnCamera`, where it sees by looks
+        self._camera: Any = EventCamera(config.camera)  # a `ColumnCamera` if `plan.by_looks`
         self._together = max(1, MAX_PIXELS_TOGETHER // (config.camera.width * config.camera.height))
         self._renderer: Any = None
         self._pictures_alone = config.observation == "luminance"
         self._seen_us = np.zeros(config.camera.width, np.int64)
         self._flicker = NO_FLICKER
-        self._way: tuple[np.ndarray, float] | None = None  # of the last step, and its share travelled
+        self._way: tuple[np.ndarray, float] | None = None  # way of the last step, and the share travelled
         self.true_events = np.empty(0, EVENT)
         self.plan: RenderPlan
 
     def reset(self, scene: Scene, place: Point, rng: np.random.Generator, t_us: int = 0) -> None:
-        """Start in a new scene at `place` (x, y) [m], without events; `rng` draws the faults."""
+        """Start in a new scene at `place` (x, y) [m]; there are no events yet. `rng` draws the faults."""
         camera = self._config.camera
         self.t_us, self.dropped, self.renders, self.events = t_us, 0, 0, np.empty(0, EVENT)
         if self._config.observation == "none":
@@ -82,21 +83,21 @@ class Sensor:
             self._real = RealSensor(camera, self._config.faults, state, rng, t_us)
 
     def step(self, start: Point, outcome: Outcome, end_us: int, way: np.ndarray | None = None) -> None:
-        """Simulate one control step from whole images: render what the vehicle flew, and set the events.
+        """Simulate one control step from whole images: render along the flown way and set the events.
 
-        Parts are never shorter than the clock's microsecond. A vehicle stopped by contact
-        or goal stands still for the rest of the step and sees nothing new. Where no event camera is
-        simulated, the last part alone is rendered.
+        The parts between renders last at least one microsecond. A vehicle stopped by contact or goal stands
+        still for the rest of the step and sees nothing new. Without an event camera, only the end of the
+        motion is rendered.
 
         Args:
-            start: Where the step began, x and y [m].
-            outcome: Where it ended.
-            end_us: When the control step ends [us].
-            way: (N + 1, 2), the planned places at the ends of N parts of the step of equal time, if it is not
-                straight [m].
+            start: Position at the start of the step, x and y [m].
+            outcome: Result of the step.
+            end_us: End of the control step [us].
+            way: (N + 1, 2), the planned places at the ends of N parts of the step, of equal time [m]; None if
+                the way is straight.
 
         Raises:
-            ValueError: The renderer gave something that is not luminance.
+            ValueError: The renderer returned something that is not luminance.
         """
         if self._config.observation == "none":
             self.t_us = end_us
@@ -123,13 +124,13 @@ class Sensor:
         self.dropped += self.lost
 
     def move_bodies(self, moving: Sequence[MovingBody], start_s: float, end_s: float) -> None:
-        """Let the scene's bodies that move go straight from where they are at a time to another [s]."""
+        """Move the scene's moving bodies straight from their places at `start_s` to those at `end_s` [s]."""
         if self._config.observation != "none":
             self._renderer.move_bodies(moving, start_s, end_s)
 
     @property
     def sees_by_looks(self) -> bool:
-        """Whether the compiled step simulates this sensor (adaptive looks at columns)."""
+        """Whether the compiled step simulates this sensor (adaptive column rendering)."""
         return self._config.observation not in WITHOUT_EVENTS and self.plan.by_looks
 
     @property
@@ -139,11 +140,11 @@ class Sensor:
 
     @property
     def lost(self) -> int:
-        """Return how many events of the last step the readout lost."""
+        """Return the number of events of the last step that the readout lost."""
         return self._real.lost
 
     def view(self) -> View:
-        """Return the arrays with which the compiled step simulates this sensor; no scene if it does not."""
+        """Return the arrays for the compiled step; without a scene if it does not simulate this sensor."""
         scene = np.empty(0, BODY), NO_NOISE, np.zeros(1, FRAME), 0.0
         bandwidth, shifts = UNLIMITED, Shifts(1.0, 1.0, 1.0)
         if self.sees_by_looks:
@@ -151,22 +152,22 @@ class Sensor:
             scene = renderer.bodies, renderer.noise, renderer.frame, renderer.cull_m
         model, memory, _ = self._camera.state
         camera = self._config.camera
-        size = (camera.width, camera.height) if self.sees_by_looks else (2, 2)  # 1 would be of another type
+        size = (camera.width, camera.height) if self.sees_by_looks else (2, 2)  # numba types 1 differently
         scratch = scratch_for(*size, len(scene[0]))
         return View(*scene, model, memory, self._seen_us, bandwidth, shifts, self._flicker, scratch)
 
     def faults(self) -> FaultState:
-        """Return the faults that the compiled step applies to the events of this sensor."""
+        """Return the faults that the compiled step applies to this sensor's events."""
         is_compiled = self.has_faults and self.sees_by_looks and self._real.is_compiled
         return self._real.state if is_compiled else NO_FAULTS
 
     @property
     def needs_python(self) -> bool:
-        """Whether the compiled step leaves something to `step` or `with_faults`."""
+        """Whether the compiled step leaves work for `step` or `with_faults`."""
         return not self.sees_by_looks or (self.has_faults and not self._real.is_compiled)
 
     def check_faults(self, start_us: int, end_us: int) -> None:
-        """Raise ValueError if the last step was to add more false events than may be."""
+        """Raise ValueError if more false events were expected in the last step than the limit allows."""
         check_expected(self._real.state, (start_us, end_us))
 
     def with_faults(self, events: np.ndarray, start_us: int, end_us: int) -> np.ndarray:
@@ -175,7 +176,7 @@ class Sensor:
         return self._real.events(events, start_us, end_us) if self.has_faults else events
 
     def _render_along(self, start: Point, end: Point, moving_us: int) -> np.ndarray:
-        """Return the events of a way from whole images."""
+        """Return the events along a way, from renders of whole images."""
         start_us = self.t_us
         batches, self.dropped = [], 0
         for first in range(0, self.renders, self._together):
@@ -197,7 +198,7 @@ class Sensor:
         return picture
 
     def _flickering(self, frames: np.ndarray, times_us: np.ndarray) -> np.ndarray:
-        """Return frames, float32 (K, H, W), under the light of their times."""
+        """Return frames, float32 (K, H, W), multiplied by the flickering light at their times."""
         if self._flicker.depth == 0.0:
             return frames
         lit: np.ndarray = frames * brightness_at(self._flicker, times_us)[:, None, None]
@@ -211,7 +212,7 @@ class Sensor:
         self._renderer = None
 
     def _poses(self, start: Point, end: Point, part: np.ndarray, t_us: np.ndarray) -> np.ndarray:
-        """Return x, y, z [m], yaw [rad] and time [s] after each part of the way, (K, 5)."""
+        """Return x, y, z [m], yaw [rad] and time [s] at each share `part` of the way, (K, 5)."""
         poses = np.zeros((part.size, 5))
         if self._way is None:
             poses[:, 0] = start[0] + (end[0] - start[0]) * part
@@ -225,7 +226,7 @@ class Sensor:
         return poses
 
     def _set_renderer(self, scene: Scene) -> None:
-        """Choose the renderer of a scene; reuse the last one while its settings stay the same."""
+        """Choose the renderer of a scene; reuse the last renderer if its settings are the same."""
         chosen, camera = plan_renders(self._planned, scene), self._config.camera
         same = self._renderer is not None
         same = same and (chosen.renderer, chosen.samples) == (self.plan.renderer, self.plan.samples)
@@ -244,7 +245,7 @@ class Sensor:
 
 
 def check_sensed(bad: int, way: Way, columns: np.ndarray) -> None:
-    """Raise ValueError if `sense_way` reported a problem; `columns` are the columns that it painted."""
+    """Raise ValueError if `sense_way` reported a problem; `columns` is the image that it rendered."""
     if bad == BAD_POSE:
         check_pose((way.end_x, way.end_y, way.height, 0.0), (way.start_us + way.moving_us) * 1e-6)
     if bad >= 0:

@@ -1,4 +1,4 @@
-"""Bodies: the states of those vehicles of a batch that have dynamics of their own."""
+"""Bodies: the states of the vehicles in a batch that are not kinematic."""
 
 from collections.abc import Callable
 from typing import Any
@@ -11,15 +11,15 @@ from envs.vehicles.dynamics import Dynamics, loop_over, parts_of_step
 
 
 class Bodies:
-    """States, parameters and the last ways of vehicles; rows of kinematic vehicles stay unused.
+    """States, parameters and last ways of vehicles; rows of kinematic vehicles are unused.
 
     Attributes:
-        dynamics: Row -> `Dynamics`, of those that have a body.
+        dynamics: Row -> `Dynamics`, for the vehicles with a body.
         ways: float64 (B, parts + 1, 2), places at the ends of the parts of the last step [m].
     """
 
     def __init__(self, count: int) -> None:
-        """Make room for `count` vehicles, all of them kinematic so far."""
+        """Allocate `count` vehicles, all of them kinematic at first."""
         self.dynamics: dict[int, Dynamics] = {}
         self._state, self._parameters = np.zeros((count, 4)), np.zeros((count, 0))
         self._tables, self._wind = np.zeros((count, 0, 0)), np.zeros((count, 2))
@@ -29,7 +29,7 @@ class Bodies:
         self.ways = np.zeros((count, 1, 2))
 
     def start(self, row: int, config: EnvConfig, dynamics: Dynamics, place: Point) -> int:
-        """Start an episode of one vehicle at `place`; return the parts of its steps, 0 if it is kinematic."""
+        """Start an episode of one vehicle at `place`; return the parts of its steps, 0 if kinematic."""
         if self.dynamics.pop(row, None) is not None:
             self._state[row], self._kinds = 0.0, None
         if dynamics.move is None:
@@ -59,7 +59,7 @@ class Bodies:
         """Move the active vehicles through one control step, as if nothing stood in the way.
 
         Args:
-            actions: (B,) integers or (B, C) float64, those that are taken now.
+            actions: (B,) integers or (B, C) float64, the actions taken now.
             active: bool (B,).
         """
         if self._kinds is None:
@@ -74,7 +74,7 @@ class Bodies:
         return self.ways[row, : self._parts[row] + 1]
 
     def state_after(self, row: int, actions: np.ndarray) -> np.ndarray:
-        """Return the state of a vehicle once these actions have been taken, float64 (S,)."""
+        """Return the state of a vehicle after these actions, float64 (S,)."""
         dynamics, state = self.dynamics[row], self._state[row].copy()
         for action in actions:
             command = np.asarray(action if dynamics.commands is None else dynamics.commands[action], float)
@@ -83,7 +83,7 @@ class Bodies:
         return state
 
     def _find_kinds(self, count: int) -> list[tuple[Callable[..., None], np.ndarray]]:
-        """Return each loop over vehicles, and the vehicles that it moves, bool (B,)."""
+        """Return each compiled loop over vehicles, with the vehicles that it moves, bool (B,)."""
         own: dict[Any, np.ndarray] = {}
         for row, dynamics in self.dynamics.items():
             own.setdefault(dynamics.move, np.zeros(count, bool))[row] = True
@@ -91,6 +91,6 @@ class Bodies:
 
 
 def _with_room(array: np.ndarray, sides: tuple[int, ...]) -> np.ndarray:
-    """Return `array` (B, ...) with at least these `sides` behind B, padded with zeros."""
+    """Return `array` (B, ...) with at least these `sides` after B, padded with zeros."""
     missing = [(0, max(0, side - here)) for side, here in zip(sides, array.shape[1:], strict=True)]
     return np.pad(array, [(0, 0), *missing]) if any(more for _, more in missing) else array

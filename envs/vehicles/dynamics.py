@@ -1,15 +1,15 @@
 """Dynamics: what turns a command into motion.
 
-`env.vehicle` names a row of `envs.config.VEHICLES`: the place, "module:function", of what makes a `Dynamics`
-from the settings of an episode. "kinematic", the paper's vehicle of three headings, is the default; it counts
-its moves, so that no error adds up, within the compiled step. Every other vehicle integrates a state by a
-compiled function:
+`env.vehicle` names a row of `envs.config.VEHICLES`: the location, "module:function", of a function that
+creates a `Dynamics` from the settings of an episode. The default is "kinematic", the paper's vehicle with
+three headings. The compiled step moves it by counting its moves, so that errors do not add up. Every other
+vehicle integrates a state by a compiled function:
 
     @numba.njit
     def move(state, command, wind, parameters, dt_s): ...
 
-It changes `state`, float64 (S,) that begins with x, y [m], vx, vy [m/s], over `dt_s` seconds. A plug-in adds
-a row, `VEHICLES["glider"] = "my_module:make_glider"`. The camera looks along +y whatever the state.
+It advances `state`, float64 (S,) that starts with x, y [m], vx, vy [m/s], by `dt_s` seconds. A plug-in adds a
+row, `VEHICLES["glider"] = "my_module:make_glider"`. The camera points along +y whatever the state.
 """
 
 import math
@@ -26,7 +26,7 @@ from core.places import resolve
 from envs.config import VEHICLES, EnvConfig
 from envs.kinematics import MIRRORED_ACTIONS, NUM_ACTIONS
 
-WAY_S = 0.01  # at most; the way of a control step is cut into straight parts of equal time
+WAY_S = 0.01  # longest of the straight parts, of equal time, into which the way of a control step is cut
 
 
 class Dynamics(NamedTuple):
@@ -34,15 +34,15 @@ class Dynamics(NamedTuple):
 
     Attributes:
         action_space: Discrete(K), or a Box of shape (C,).
-        straight: The action that flies straight ahead; it is followed until the first delayed one is due.
-        top_speed_mps: No faster than this [m/s], so that the renders of a step can be planned.
-        move: Compiled, as above. None: the vehicle is the kinematic one.
-        state: float64 (S,) at the start; x and y are the spawn's, whatever stands here.
-        parameters: float64 (P,), handed to `move`.
-        wind: float64 (2,) [m/s], handed to `move`.
+        straight: The action that flies straight ahead; it is taken until the first delayed action is due.
+        top_speed_mps: Upper bound of the speed [m/s], used to plan the renders of a step.
+        move: Compiled function, as above. None: the vehicle is kinematic.
+        state: float64 (S,), state at the start; x and y are replaced by the start position.
+        parameters: float64 (P,), passed to `move`.
+        wind: float64 (2,) [m/s], passed to `move`.
         commands: float64 (K, C), the command of each action of a Discrete; None: an action is a command.
-        sideways: Largest sideways speed [m/s] and acceleration [m/s^2] that a planner may count on; None: the
-            vehicle cannot be planned for (`envs.vehicles.planning`).
+        sideways: Largest sideways speed [m/s] and acceleration [m/s^2] that a planner may count on; None:
+            planning for this vehicle is not possible (`envs.vehicles.planning`).
     """
 
     action_space: spaces.Space
@@ -74,10 +74,10 @@ def make_kinematic(config: EnvConfig) -> Dynamics:
 
 
 def mirrored_actions(dynamics: Dynamics) -> list[int]:
-    """Return the action that each action of a Discrete becomes when left and right are exchanged.
+    """Return the mirror image, left and right exchanged, of each action of a Discrete.
 
     Raises:
-        ValueError: A command has no mirror image among the others.
+        ValueError: A command has no mirror image among the commands.
     """
     if dynamics.commands is None:
         return MIRRORED_ACTIONS
@@ -89,7 +89,7 @@ def mirrored_actions(dynamics: Dynamics) -> list[int]:
 
 
 def planned_config(config: EnvConfig, dynamics: Dynamics) -> EnvConfig:
-    """Return the settings whose speed and rate bound each part of a step's way, to plan its renders by."""
+    """Return settings for planning renders, whose speed and rate bound the length of each part of a step."""
     if dynamics.move is None:
         return config
     rate_hz = config.control_hz * parts_of_step(config)
@@ -97,12 +97,12 @@ def planned_config(config: EnvConfig, dynamics: Dynamics) -> EnvConfig:
 
 
 def number_type(space: spaces.Space) -> type:
-    """Return the type in which actions of a space are queued and taken."""
+    """Return the type in which actions of a space are stored."""
     return np.int64 if isinstance(space, spaces.Discrete) else np.float64
 
 
 def wrong_actions(space: spaces.Space, actions: np.ndarray) -> np.ndarray:
-    """Return which of some actions are not in a Discrete(K) or a Box, bool (B,)."""
+    """Return whether each action is outside a Discrete(K) or a Box, bool (B,)."""
     if isinstance(space, spaces.Discrete):
         if actions.dtype.kind not in "iu":  # text and objects cannot be compared with numbers
             return np.ones(len(actions), bool)
@@ -114,7 +114,7 @@ def wrong_actions(space: spaces.Space, actions: np.ndarray) -> np.ndarray:
 
 
 def parts_of_step(config: EnvConfig) -> int:
-    """Return into how many straight parts the way of a control step is cut, each at most `WAY_S` long."""
+    """Return the number of straight parts of a control step's way, each at most `WAY_S` long."""
     return max(1, math.ceil((1.0 - 1e-9) / (config.control_hz * WAY_S)))
 
 
@@ -122,9 +122,9 @@ def parts_of_step(config: EnvConfig) -> int:
 def loop_over(move: Callable[..., None]) -> Callable[..., None]:
     """Return the compiled loop that moves all active vehicles of one kind by `move`.
 
-    It takes states (B, S), commands (B, C), winds (B, 2), parameters (B, P), the seconds of a part (B,), the
-    number of parts (B,), the places at the ends of the parts (B, parts + 1, 2), which it fills, and whether
-    each vehicle is active, bool (B,).
+    The loop takes states (B, S), commands (B, C), winds (B, 2), parameters (B, P), the seconds of a part
+    (B,), the number of parts (B,), the places at the ends of the parts (B, parts + 1, 2), which it fills,
+    and whether each vehicle is active, bool (B,).
     """
 
     @numba.njit(error_model="numpy")

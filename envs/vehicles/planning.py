@@ -1,10 +1,10 @@
 """The cheapest way of a vehicle with a body, by dynamic programming over place and velocity.
 
-The vehicle is planned for as one that flies ahead at `EnvConfig.speed_mps` and accelerates to a side, to the
-other, or not at all. Rows of the lattice are `ROW_S` of flight apart; in each, the cost-to-go is tabulated
-over the sideways velocity, whose steps are one push long, and over x. Places have the prices of
-`envs.scene.planning`. Any state is then priced by the vehicle's own dynamics: each command is held for
-`LOOK_S`, and the cost-to-go is taken where that leads.
+The plan assumes that the vehicle flies ahead at `EnvConfig.speed_mps` and accelerates left, right or not at
+all. Rows of the lattice are `ROW_S` of flight apart. For each row the cost-to-go is tabulated over x and over
+the sideways velocity, in steps of the velocity gained by accelerating for one row. Places have the prices of
+`envs.scene.planning`. The cost of a command in any state then follows from the vehicle's own dynamics: the
+command is held for `LOOK_S`, and the cost-to-go is read at the resulting state.
 """
 
 import math
@@ -22,8 +22,8 @@ from envs.scene.planning import LATTICE_M, SIDE_PRICE, CostToGo, cost_to_go, lat
 from envs.scene.scene import Scene
 from envs.vehicles.dynamics import WAY_S, Dynamics
 
-ROW_S = 0.05  # about; a row is a whole number of lattice steps
-LOOK_S = 0.1  # for which a command is held until the cost-to-go is taken
+ROW_S = 0.05  # approximate time between rows; a row is a whole number of lattice steps
+LOOK_S = 0.1  # time for which a command is held before the cost-to-go is read
 
 
 @dataclass(frozen=True)
@@ -32,11 +32,11 @@ class BodyPlan:
 
     Attributes:
         costs: float32 (rows, sideways velocities, columns); row 0 is y = 0.
-        prices: float64 (lattice rows, columns), of being at each place, `envs.scene.planning`.
-        first_x_m: Where column 0 is [m].
-        row_m: From row to row [m].
-        step_mps: From velocity to velocity [m/s]; the middle one is 0.
-        dynamics: The vehicle, whose actions are a Discrete.
+        prices: float64 (lattice rows, columns), price of being at each place, see `envs.scene.planning`.
+        first_x_m: x of column 0 [m].
+        row_m: Distance between rows [m].
+        step_mps: Step between sideways velocities [m/s]; the middle velocity is 0.
+        dynamics: The vehicle; its action space is a Discrete.
     """
 
     costs: np.ndarray
@@ -47,7 +47,7 @@ class BodyPlan:
     dynamics: Dynamics
 
     def of_actions(self, state: np.ndarray) -> np.ndarray:
-        """Return the cost of each action in a state, float64 (K,); the state is that of the dynamics."""
+        """Return the cost of each action in a state of the dynamics, float64 (K,)."""
         own = self.dynamics
         sizes = self.first_x_m, self.row_m, self.step_mps
         label: np.ndarray = _label_by(own.move)(
@@ -57,14 +57,15 @@ class BodyPlan:
 
 
 class Planner:
-    """The plans of one environment (`envs.corridor.CorridorEnv`), made again when they no longer hold.
+    """The plans of one environment (`envs.corridor.CorridorEnv`), computed again when they become invalid.
 
-    A plan holds while the scene is the same, and what moves in it keeps to its path. Among bodies that move,
-    a kinematic vehicle plans at every step, since its way to a side takes longer than that straight ahead.
+    A plan stays valid while the scene is the same and its moving bodies keep to their paths. Among moving
+    bodies a kinematic vehicle plans at every step, because flying to a side takes it longer per row than
+    flying straight ahead.
     """
 
     def __init__(self) -> None:
-        """Begin without a plan."""
+        """Start without a plan."""
         self._scene: Scene | None = None
         self._moving: tuple[MovingBody, ...] = ()
         self._plan: BodyPlan
@@ -75,7 +76,7 @@ class Planner:
 
         Args:
             env: The environment, in an episode.
-            sight_m: Ways of a kinematic vehicle end so far ahead; infinite: at the goal line [m].
+            sight_m: Distance ahead at which ways of a kinematic vehicle end [m]; infinite: at the goal line.
         """
         config, same = env.config, env.scene is self._scene
         if env.dynamics.move is None:
@@ -93,7 +94,7 @@ class Planner:
 
 
 def _now(env: Any) -> tuple[float, float]:
-    """Return the time [s], and where the vehicle is, y [m]."""
+    """Return the time [s] and the vehicle's y [m]."""
     return 1e-6 * env.info()["t_us"], env.camera_pose()[1]
 
 
@@ -108,13 +109,13 @@ def plan_body(
 
     Args:
         scene: The corridor.
-        config: Its settings.
+        config: Settings of the episode.
         dynamics: The vehicle.
-        moving: What moves in it: each row is priced as it is when the vehicle comes there.
-        now: The time [s], and where the vehicle is, y [m].
+        moving: Moving bodies; each row is priced at the time when the vehicle gets there.
+        now: The time [s] and the vehicle's y [m].
 
     Raises:
-        ValueError: The vehicle has no discrete commands, or does not say how it flies to a side.
+        ValueError: The vehicle has no discrete commands or no `Dynamics.sideways`.
     """
     if dynamics.commands is None or dynamics.sideways is None:
         rule = "a planner needs a vehicle with discrete commands that states `Dynamics.sideways`"
@@ -133,7 +134,7 @@ def plan_body(
 
 @numba.njit(cache=True, error_model="numpy")
 def _costs(prices: np.ndarray, stride: int, row_s: float, step_mps: float, half: int) -> np.ndarray:
-    """Return the least price to the last row from each row, velocity and column."""
+    """Return the smallest sum of prices to the last row, from each row, velocity and column."""
     last, columns = prices.shape[0] - 1, prices.shape[1]
     rows = (last + stride - 1) // stride + 1
     costs = np.zeros((rows, 2 * half + 1, columns), np.float32)
@@ -157,7 +158,7 @@ def _costs(prices: np.ndarray, stride: int, row_s: float, step_mps: float, half:
 
 @numba.njit(cache=True, error_model="numpy")
 def _between(values: np.ndarray, place: float) -> float:
-    """Return the value at a place between two elements; outside, that of the edge."""
+    """Return the linearly interpolated value at a place; outside the array, the value at its edge."""
     place = min(max(place, 0.0), len(values) - 1.0)
     first = min(int(place), len(values) - 2)
     return values[first] + (place - first) * (values[first + 1] - values[first])
@@ -165,7 +166,7 @@ def _between(values: np.ndarray, place: float) -> float:
 
 @numba.njit(cache=True, error_model="numpy")
 def _cost_at(costs: np.ndarray, column: float, row: float, speed: float) -> float:
-    """Return the cost-to-go between rows, velocities and columns, all in lattice steps."""
+    """Return the cost-to-go interpolated between rows, velocities and columns, all in lattice steps."""
     row = min(max(row, 0.0), len(costs) - 1.0)
     j = max(0, min(int(row), len(costs) - 2))
     speed = min(max(speed, 0.0), costs.shape[1] - 1.0)
@@ -181,7 +182,7 @@ def _cost_at(costs: np.ndarray, column: float, row: float, speed: float) -> floa
 
 @lru_cache(maxsize=16)
 def _label_by(move: Callable[..., None] | None) -> Any:
-    """Return the compiled function that prices the commands of a state by a vehicle's dynamics."""
+    """Return the compiled function that computes the cost of each command in a state, using `move`."""
     steps = math.ceil(LOOK_S / WAY_S)
 
     @numba.njit(error_model="numpy")

@@ -1,16 +1,17 @@
 """Point mass: a planar body with inertia that follows a desired velocity or acceleration.
 
-With velocity v, wind w, drag k and an acceleration a of the rotors:
+With velocity v, wind w, drag k and an acceleration a from the rotors:
 
     dx/dt = v,    dv/dt = a + k (w - v)
 
-- command "velocity" u: a = (u - v) / tau, cut to the norm max_acceleration;
-- command "acceleration" u: da/dt = (u - a) / tau, with u cut to the norm max_acceleration.
+- command "velocity" u: a = (u - v) / tau, limited to the norm max_acceleration;
+- command "acceleration" u: da/dt = (u - a) / tau, with u limited to the norm max_acceleration.
 
-A mass of `mass_ratio` times the nominal one divides every acceleration, drag included. x points right, y
-ahead. Without drag every step is exact, whatever its length, also through the moment where the limit stops
-to bind. With drag the same solution is applied in pieces of at most `PIECE_S`, in which the direction of the
-cut acceleration is constant: positions after 5 s err by less than 0.1 mm (tests/envs/test_point_mass.py).
+A mass of `mass_ratio` times the nominal mass divides every acceleration, drag included. x points right, y
+ahead. Without drag every step is exact, whatever its length, even if the acceleration limit stops to apply
+within the step. With drag the same solution is applied in pieces of at most `PIECE_S`, in which a limited
+acceleration has a constant direction: positions after 5 s err by less than 0.1 mm
+(tests/envs/test_point_mass.py).
 """
 
 import math
@@ -26,7 +27,7 @@ from envs.scene.layouts import refuse_unless
 from envs.vehicles.dynamics import Dynamics
 
 PIECE_S = 1e-3
-SHORT_S = 1e-9  # a piece is never shorter, so that rounding cannot stall it
+SHORT_S = 1e-9  # shortest piece, so that rounding cannot stall the integration
 COMMANDS = ("velocity", "acceleration")
 
 
@@ -35,18 +36,18 @@ class PointMass:
     """Settings of a point mass, as `env.body` gives them.
 
     Attributes:
-        command: What an action asks for: "velocity" or "acceleration". An action is a Box of two numbers in
-            [-1, 1], right and ahead, times max_speed_mps or max_acceleration_mps2.
-        primitives: If at least 2, an action is one of so many instead, Discrete: sideways velocities from
-            left to right at `speed_mps` ahead, or sideways accelerations. Three are ordered as the kinematic
-            vehicle's: ahead, left, right. 0: a Box.
+        command: Quantity that an action commands: "velocity" or "acceleration". An action is a Box of two
+            numbers in [-1, 1], right and ahead, times max_speed_mps or max_acceleration_mps2.
+        primitives: If at least 2, the action space is Discrete with this many actions: sideways velocities
+            from left to right at `speed_mps` ahead, or sideways accelerations. Three actions have the order
+            of the kinematic vehicle: ahead, left, right. 0: a Box.
         tau_s: Time constant of the lag [s].
-        max_acceleration_mps2: Of the nominal mass, by the rotors [m/s^2].
+        max_acceleration_mps2: Largest acceleration of the nominal mass by the rotors [m/s^2].
         max_speed_mps: Largest commanded speed [m/s].
         side_speed_mps: Largest sideways velocity of the primitives [m/s].
         drag_per_s: Linear drag [1/s].
-        mass_ratio: Actual mass over the nominal one.
-        wind_x_mps, wind_y_mps: Constant wind [m/s]; it acts through the drag.
+        mass_ratio: Actual mass over the nominal mass.
+        wind_x_mps, wind_y_mps: Constant wind [m/s], which acts through the drag.
     """
 
     command: str = "velocity"
@@ -87,10 +88,10 @@ class PointMass:
 
 
 def make_point_mass(config: EnvConfig, nominal: PointMass = PointMass()) -> Dynamics:
-    """Return the point mass of an episode: the `nominal` one with the values of `config.body`.
+    """Return the point mass of an episode: `nominal` with fields replaced by `config.body`.
 
     Raises:
-        ValueError: `config.body` has an unknown key or a wrong value, or `config.speed_mps` is too high.
+        ValueError: `config.body` has an unknown key or an invalid value, or `config.speed_mps` is too high.
     """
     known = [field.name for field in fields(nominal)]
     for key in config.body:
@@ -124,9 +125,9 @@ def make_point_mass(config: EnvConfig, nominal: PointMass = PointMass()) -> Dyna
 def make_crazyflie(config: EnvConfig) -> Dynamics:
     """Return a Crazyflie 2.0 under its own velocity controller.
 
-    Its firmware tilts by 25 degrees for each m/s of velocity error, at most 20 degrees (crazyflie-firmware,
+    Its firmware tilts by 25 degrees per m/s of velocity error, at most 20 degrees (crazyflie-firmware,
     platform_defaults_cf2.h: PID_VEL_X_KP, PID_VEL_ROLL_MAX): tau = 1 / (g tan 25 deg), acceleration up to
-    g tan 20 deg. Drag is that of its rotors in hover, 4 k_d sqrt(m g / (4 k_eta)) / m with m = 0.03 kg,
+    g tan 20 deg. Drag is the drag of its rotors in hover, 4 k_d sqrt(m g / (4 k_eta)) / m with m = 0.03 kg,
     k_eta = 2.3e-8 N s^2 (Foerster, System Identification of the Crazyflie 2.0, ETH 2015) and
     k_d = 1.025e-6 kg (RotorPy, crazyflie_params.py).
     """
@@ -144,7 +145,7 @@ def _sideways(body: PointMass) -> tuple[float, float]:
 
 
 def _commands(body: PointMass, speed_mps: float) -> tuple[np.ndarray | None, Any]:
-    """Return the commands of the primitives, None for a Box, and the action that flies straight ahead."""
+    """Return the commands of the primitives (None for a Box), and the action that flies straight ahead."""
     ahead = speed_mps / body.max_speed_mps if body.command == "velocity" else 0.0
     if not body.primitives:
         return None, np.array([0.0, ahead])
@@ -175,15 +176,15 @@ def move(state, command, wind, parameters, dt_s):
 
 @numba.njit(cache=True, error_model="numpy")
 def _follow_velocity(state, command, wind, constants, piece):
-    """Advance by at most `piece` seconds; return by how many."""
+    """Advance under a velocity command by at most `piece` seconds; return the seconds advanced."""
     rate, limit, drag = constants
     ax, ay = rate * (command[0] - state[2]), rate * (command[1] - state[3])
     wish = math.hypot(ax, ay)
     if wish > limit * (1.0 + 1e-12):
         ax, ay = ax * limit / wish, ay * limit / wish
         if drag == 0.0:
-            piece = min(piece, max(SHORT_S, (wish - limit) / (rate * limit)))  # until the limit stops to bind
-        else:  # the direction of the middle of the piece
+            piece = min(piece, max(SHORT_S, (wish - limit) / (rate * limit)))  # until the limit has no effect
+        else:  # the direction at the middle of the piece
             bx = command[0] - state[2] - 0.5 * piece * (ax + drag * (wind[0] - state[2]))
             by = command[1] - state[3] - 0.5 * piece * (ay + drag * (wind[1] - state[3]))
             wish = max(limit, rate * math.hypot(bx, by))
@@ -199,27 +200,27 @@ def _follow_velocity(state, command, wind, constants, piece):
 
 @numba.njit(cache=True, error_model="numpy")
 def _follow_acceleration(state, command, wind, constants, piece):
-    """Advance by `piece` seconds."""
+    """Advance under an acceleration command by `piece` seconds."""
     rate, drag = constants
     first, second = _integrals(rate, piece)
     for axis in range(2):
         beyond = state[4 + axis] - command[axis]
         mean = command[axis] + beyond * first / piece
         _relax_axis(state, axis, mean + drag * wind[axis], drag, piece)
-        state[axis] += beyond * (second - 0.5 * first * piece)  # a decays: more of it acts early
+        state[axis] += beyond * (second - 0.5 * first * piece)  # because a decays, more of it acts early
         state[4 + axis] = command[axis] + beyond * math.exp(-rate * piece)
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _relax(state, ax, ay, rate, seconds):
-    """Solve dx/dt = v, dv/dt = a - rate v over some seconds, exactly, in both axes."""
+    """Solve dx/dt = v, dv/dt = a - rate v exactly over `seconds`, in both axes."""
     _relax_axis(state, 0, ax, rate, seconds)
     _relax_axis(state, 1, ay, rate, seconds)
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _relax_axis(state, axis, a, rate, seconds):
-    """Solve dx/dt = v, dv/dt = a - rate v over some seconds, exactly, in one axis."""
+    """Solve dx/dt = v, dv/dt = a - rate v exactly over `seconds`, in one axis."""
     first, second = _integrals(rate, seconds)
     v = state[2 + axis]
     state[axis] += v * seconds + (a - rate * v) * second
@@ -228,9 +229,9 @@ def _relax_axis(state, axis, a, rate, seconds):
 
 @numba.njit(cache=True, error_model="numpy")
 def _integrals(rate, seconds):
-    """Return the first and the second integral of exp(-rate t) over some seconds."""
+    """Return the first and the second integral of exp(-rate t) over `seconds`."""
     x = rate * seconds
-    if x < 1e-3:  # where the difference below would cancel
+    if x < 1e-3:  # here the difference below would cancel
         first = seconds * (1.0 - x * (0.5 - x * (1.0 / 6.0 - x / 24.0)))
         return first, seconds * seconds * (0.5 - x * (1.0 / 6.0 - x * (1.0 / 24.0 - x / 120.0)))
     first = -math.expm1(-x) / rate

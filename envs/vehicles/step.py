@@ -1,9 +1,9 @@
 """One control step of many vehicles in one compiled call.
 
-It moves each vehicle, finds contact and goal, and simulates the camera of every sensor that sees
-by looks (`envs.sensor`), with its faults. Other sensors, and rarer faults (`RealSensor.is_compiled`), take
-their turn in Python afterwards. A kinematic vehicle is moved here; others come with the way of their step
-(`envs.vehicles.bodies`).
+It moves each vehicle, finds contact and goal, and simulates every sensor with adaptive column rendering
+(`Sensor.sees_by_looks`), including its faults. Python handles other sensors and rarer faults
+(`RealSensor.is_compiled`) afterwards. A kinematic vehicle is moved here; for other vehicles
+`envs.vehicles.bodies` provides the way of the step.
 """
 
 import math
@@ -26,19 +26,19 @@ _FLOATS = (
     *("spawn_x_m", "spawn_y_m", "x_m", "y_m"),
     *("vx_mps", "vy_mps"),  # of a vehicle with a body
     *("speed_mps", "control_hz", "radius_m", "height_m", "half_width_m", "length_m"),
-    *("max_step_m", "limit_us"),  # way between two renders, and when the time is up
-    # The last step: where it began, the share of it that it moved, its reward, its renders.
+    *("max_step_m", "limit_us"),  # longest way between two renders; time limit of the episode
+    # The last step: its start, the share of it in which the vehicle moved, its reward, its renders.
     *("start_x_m", "start_y_m", "share", "reward", "renders"),
 )
 _WHOLE = (
     "steps",  # of the episode so far
-    *("forward", "left", "right"),  # how often each action was taken
+    *("forward", "left", "right"),  # number of times each action was taken
     "parts",  # straight parts of the way of a step; 0: the vehicle is kinematic
     "delay",  # steps from a decision to its action
-    *("start_us", "t_us"),  # when the last step began and ended
-    "window_us",  # its length; before the first step, the length of that
-    *("num_events", "dropped"),  # events of it, and those that the camera lost in it
-    "problem",  # `GOOD`, `BAD_REWARD`, `TOO_MANY_FALSE`, or what `sense_way` says
+    *("start_us", "t_us"),  # start and end of the last step
+    "window_us",  # length of the last step; before any step, the length of the first
+    *("num_events", "dropped"),  # number of events of the last step, and of events lost in it
+    "problem",  # `GOOD`, `BAD_REWARD`, `TOO_MANY_FALSE`, or the problem that `sense_way` reports
 )
 _FLAGS = ("by_looks", "success", "collision", "truncated", "over")
 VEHICLE = np.dtype(
@@ -49,9 +49,9 @@ VEHICLE = np.dtype(
 
 @numba.njit(cache=True, error_model="numpy")
 def corridor_list(corridor, count):
-    """Return a list of `count` times the same corridor: sections that stand, those that move, and a `View`.
+    """Return a typed list that repeats one element `count` times.
 
-    Or with the same `FaultState`.
+    The element is a corridor (standing sections, moving sections and a `View`) or a `FaultState`.
     """
     corridors = List()
     for _ in range(count):
@@ -61,7 +61,7 @@ def corridor_list(corridor, count):
 
 @numba.njit(cache=True, error_model="numpy")
 def set_corridor(corridors, row, corridor):
-    """Replace one corridor of a list."""
+    """Replace one element of a list from `corridor_list`."""
     corridors[row] = corridor
 
 
@@ -71,15 +71,15 @@ def step_all(rows, corridors, faulty, actions, ways, active):
 
     Args:
         rows: (B,) VEHICLE, changed in place.
-        corridors: A list of B, see `corridor_list`.
-        faulty: A list of B `FaultState`, of cameras that see by looks.
-        actions: int64 (B,), of kinematic vehicles.
+        corridors: A list of B corridors, see `corridor_list`.
+        faulty: A list of B `FaultState`; used for sensors with `by_looks`.
+        actions: int64 (B,), used for kinematic vehicles.
         ways: float64 (B, N, 2), the planned places of vehicles with bodies, `Bodies.ways`.
         active: bool (B,).
 
     Returns:
-        EVENT of those that see by looks, vehicle after vehicle; int64 (B + 1,), where the events of each end;
-        and both before faults, the same array where no vehicle has any.
+        EVENT of the sensors with `by_looks`, vehicle after vehicle; int64 (B + 1,), the bounds of each
+        vehicle's events; and both again before faults. Without faults the event arrays are the same object.
     """
     found, ends = [np.empty(0, EVENT)], np.zeros(rows.size + 1, np.int64)
     true, true_ends, spoilt = [np.empty(0, EVENT)], np.zeros(rows.size + 1, np.int64), False
@@ -93,7 +93,7 @@ def step_all(rows, corridors, faulty, actions, ways, active):
                 true.append(events)
                 true_ends[row + 1] += events.size
                 faults = faulty[row]
-                if faults.is_on and rows[row].problem == GOOD:  # while the camera's memory is in the cache
+                if faults.is_on and rows[row].problem == GOOD:  # here, because the camera's memory is cached
                     span_us, spoilt = (rows[row].start_us, rows[row].t_us), True
                     events = spoil(events, span_us, view.model, view.memory, faults)
                     if faults.expected[0] > MAX_EVENTS_PER_FRAME:
@@ -107,7 +107,7 @@ def step_all(rows, corridors, faulty, actions, ways, active):
 
 @numba.njit(cache=True, error_model="numpy")
 def _concatenated(parts, total):
-    """Concatenate EVENT arrays of so many events in all."""
+    """Concatenate EVENT arrays with `total` events in all."""
     together, size = np.empty(total, EVENT), 0
     for events in parts:
         together[size : size + events.size] = events
@@ -117,7 +117,7 @@ def _concatenated(parts, total):
 
 @numba.njit(cache=True, error_model="numpy")
 def _move(vehicle, action, still_and_moving, way):
-    """Move a vehicle, and note the result in its record."""
+    """Move a vehicle and store the result in its record."""
     vehicle.steps += 1
     lane = Lane(vehicle.radius_m, vehicle.half_width_m, vehicle.length_m)
     start = vehicle.x_m, vehicle.y_m
@@ -155,7 +155,7 @@ def way_of(vehicle):
 
 @numba.njit(cache=True, error_model="numpy")
 def way_of_part(vehicle, way, part):
-    """Return the `Way` of one part of the last step, as far as the vehicle moved in it."""
+    """Return the `Way` of one part of the last step, up to where the vehicle stopped."""
     begin_us = vehicle.start_us + vehicle.window_us * part // vehicle.parts
     end_us = vehicle.start_us + vehicle.window_us * (part + 1) // vehicle.parts
     share = min(1.0, max(0.0, vehicle.share * vehicle.parts - part))
@@ -166,7 +166,7 @@ def way_of_part(vehicle, way, part):
 
 @numba.njit(cache=True, error_model="numpy", inline="always")
 def _look(vehicle, view, way):
-    """Return the events of the last step of a vehicle, sorted."""
+    """Return the sorted events of a vehicle's last step."""
     events = _look_along(vehicle, view, way, 0)
     for part in range(1, vehicle.parts):
         if vehicle.problem == GOOD:
@@ -176,7 +176,7 @@ def _look(vehicle, view, way):
 
 @numba.njit(cache=True, error_model="numpy", inline="always")
 def _look_along(vehicle, view, places, part):
-    """Return the events of a part of the last step; none once the vehicle has stopped."""
+    """Return the events of a part of the last step; there are none once the vehicle has stopped."""
     if vehicle.parts == 0:
         way, way_m = way_of(vehicle), vehicle.share * vehicle.speed_mps / vehicle.control_hz
     else:

@@ -1,16 +1,16 @@
 """Task: what a control step is worth, and what ends an episode.
 
-`env.task` names a row of `envs.config.TASKS`. "corridor", the paper's, is the default: metres of progress
+`env.task` names a row of `envs.config.TASKS`. The default is "corridor", the paper's task: metres of progress
 along y, +100 at the goal line, -100 at a contact, and a time limit (appendix D.1.1). The compiled step judges
-it while it moves the vehicle. Any other task is the place, "module:attribute", of a compiled function:
+this task itself. Any other row is the location, "module:attribute", of a compiled function:
 
     @numba.njit
     def judge(vehicle): ...
 
-It is called after each control step with the vehicle's `envs.vehicles.step.VEHICLE` record, judged as in
-the corridor: where the vehicle was and is, its velocity, the clock, `reward`, `success`, `collision` and
-`truncated`. It may change those last four. A vehicle always stops where it touches something. A plug-in
-adds a row, `TASKS["gentle"] = "my_module:judge"`.
+It is called after each control step with the vehicle's `envs.vehicles.step.VEHICLE` record, which holds the
+results of the task "corridor": last and current position, velocity, the clock, `reward`, `success`,
+`collision` and `truncated`. The function may change the last four. A vehicle always stops at contact. A
+plug-in adds a row, `TASKS["gentle"] = "my_module:judge"`.
 """
 
 from collections.abc import Callable
@@ -27,7 +27,7 @@ Judge = Callable[..., None]
 
 
 def judge_of(task: str) -> Judge | None:
-    """Return the function that judges the steps of a task; None for the corridor's, which needs no call."""
+    """Return the function that judges the steps of a task; None for "corridor", which needs no call."""
     return resolve(TASKS[task]) if TASKS[task] else None
 
 

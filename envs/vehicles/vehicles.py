@@ -1,4 +1,4 @@
-"""Vehicles side by side: their records, and the events of their last steps."""
+"""A batch of vehicles: their records, and the events of their last steps."""
 
 import dataclasses
 from typing import Any
@@ -35,13 +35,13 @@ NOTHING_MOVES = np.zeros((0, 9))
 
 @dataclasses.dataclass
 class Moving:
-    """What moves in the scene of a vehicle.
+    """The moving bodies in a vehicle's scene.
 
     Attributes:
-        bodies: On the paths that they are on now; the last one is the ball that is thrown, if any.
-        throws: Of the episode.
+        bodies: Moving bodies on their current paths; if balls are thrown, the ball comes last.
+        throws: Throws of the episode; None: no balls.
         sections: float64 (M, 9), filled by `envs.scene.paths.moving_sections`.
-        thrown: How many throws there have been.
+        thrown: Number of throws so far.
     """
 
     bodies: tuple[MovingBody, ...]
@@ -50,7 +50,7 @@ class Moving:
     thrown: int = 0
 
     def throw(self, t_s: float, state: tuple[float, ...]) -> None:
-        """Throw the ball at a vehicle, x, y [m], vx, vy [m/s], if it is time to."""
+        """Throw the ball at a vehicle of `state` x, y [m], vx, vy [m/s], if a throw is due."""
         throws = self.throws.throws if self.throws is not None else ()
         if self.throws is not None and self.thrown < len(throws) and throws[self.thrown].t_s <= t_s:
             ball = self.throws.thrown(self.thrown, t_s, (state[0], state[1], state[2], state[3]))
@@ -58,7 +58,7 @@ class Moving:
 
 
 class StepError(ValueError):
-    """Error of a step, with the row of the vehicle."""
+    """Error in a step, with the row of the vehicle."""
 
     def __init__(self, row: int, reason: str) -> None:
         """Store the row and the reason."""
@@ -67,32 +67,32 @@ class StepError(ValueError):
 
 
 class Vehicles:
-    """Vehicles side by side, each in a corridor of its own.
+    """A batch of vehicles, each in its own corridor.
 
     Attributes:
-        rows: (B,) VEHICLE, where each is and what its last step brought.
-        events: EVENT of the last step of all, vehicle after vehicle, faults included.
+        rows: (B,) VEHICLE, state of each vehicle and the results of its last step.
+        events: EVENT of the last step of all vehicles, one after the other, faults included.
         ends: int64 (B + 1,), vehicle b has events ends[b] .. ends[b + 1] - 1.
-        seen: EVENT of those that the neighbour filter of each vehicle leaves.
-        seen_ends: Their ends.
-        num_seen: int64 (B,), how many each vehicle's last step brought.
+        seen: EVENT that pass the neighbour filter of their vehicle.
+        seen_ends: int64 (B + 1,), like `ends`, for `seen`.
+        num_seen: int64 (B,), number of events in `seen` in each vehicle's last step.
     """
 
     def __init__(self, count: int) -> None:
-        """Make room for `count` vehicles, none of which has started."""
+        """Allocate `count` vehicles, none of which has started."""
         self.rows = np.zeros(count, VEHICLE)
         self.rows["over"] = True
         self._sensors: list[Sensor | None] = [None] * count
         self._in_python: set[int] = set()
         self._corridors: Any = None
-        self._faults: Any = None  # those that the compiled step applies
+        self._faults: Any = None  # faults that the compiled step applies
         self._faults_of: list[FaultState | None] = [None] * count
         self._bodies = Bodies(count)
-        self._straight = np.zeros(count, np.int64)  # actions of kinematic vehicles where there is none
-        self._moving: dict[int, Moving] = {}  # of the rows in whose scenes something moves
-        self._judges: dict[int, task.Judge] = {}  # of the rows whose task is not the corridor's
-        self._decided = np.zeros((count, 0), np.int64)  # actions not yet taken, the delay's steps in turn
-        self._last_us = np.full((count, 0, 0), NEVER)  # of the neighbour filters, where there are any
+        self._straight = np.zeros(count, np.int64)  # headings for `step_all` if actions are a Box
+        self._moving: dict[int, Moving] = {}  # row -> moving bodies of its scene, if it has any
+        self._judges: dict[int, task.Judge] = {}  # row -> judge of its task, if not "corridor"
+        self._decided = np.zeros((count, 0), np.int64)  # ring buffers of actions not yet taken
+        self._last_us = np.full((count, 0, 0), NEVER)  # state of the neighbour filters
         self._support, self._tau_us = np.zeros((2, count), np.int64)
         self.num_seen = np.zeros(count, np.int64)
         self.forget_events()
@@ -106,7 +106,7 @@ class Vehicles:
         spawn: Point,
         dynamics: Dynamics,
     ) -> None:
-        """Put a vehicle at a place, x and y [m], in a scene that its sensor has been reset to."""
+        """Start a vehicle at `spawn`, x and y [m], in a scene to which its sensor has been reset."""
         vehicle = self.rows[row : row + 1]
         vehicle[:] = np.zeros(1, VEHICLE)
         self.num_seen[row] = 0
@@ -131,7 +131,7 @@ class Vehicles:
             self._faults = corridor_list(faults, len(self.rows))
             self._faults_of = [faults] * len(self.rows)
         set_corridor(self._corridors, row, corridor)
-        if faults is not self._faults_of[row]:  # numba takes long to find the type of a random stream
+        if faults is not self._faults_of[row]:  # numba is slow to find the type of a random stream
             set_corridor(self._faults, row, faults)
             self._faults_of[row] = faults
         self._set_filter(row, config)
@@ -154,7 +154,7 @@ class Vehicles:
         Args:
             actions: int64 (B,) or float64 (B, C), valid; decided now, and taken when the delay of each
                 vehicle is over.
-            active: bool (B,); others stay as they are, without events. At least one vehicle has started.
+            active: bool (B,); the others stay unchanged, without events. At least one vehicle has started.
 
         Raises:
             StepError: A number became NaN or infinite; the vehicle's episode is over.
@@ -222,7 +222,7 @@ class Vehicles:
         return self._bodies.state_after(row, self.decided(row))
 
     def moving(self, row: int) -> tuple[MovingBody, ...]:
-        """Return the bodies that move in a vehicle's scene, on the paths that they are on now."""
+        """Return the moving bodies of a vehicle's scene on their current paths."""
         return self._moving[row].bodies if row in self._moving else ()
 
     def forget_events(self) -> None:
@@ -232,7 +232,7 @@ class Vehicles:
         self._true, self._true_ends = self.events, self.ends.copy()
 
     def _set_delay(self, row: int, steps: int, straight: Any) -> None:
-        """Begin an episode with decisions to move straight ahead, as many as are under way."""
+        """Start an episode with `steps` pending decisions to fly straight ahead."""
         self.rows["delay"][row] = steps
         action = np.asarray(straight)
         if self._decided.shape[2:] != action.shape or self._decided.dtype != action.dtype:
@@ -243,7 +243,7 @@ class Vehicles:
         self._decided[row] = action
 
     def _start_moving(self, row: int, scene: Scene) -> np.ndarray:
-        """Begin an episode's moving bodies; return the array of their sections, (M, 9)."""
+        """Start the moving bodies of an episode; return the array of their sections, (M, 9)."""
         self._moving.pop(row, None)
         if not scene.movers:
             return NOTHING_MOVES
@@ -263,7 +263,7 @@ class Vehicles:
         end_us = clock_us(int(vehicle["steps"]) + 1, float(vehicle["control_hz"]))
         ahead = (
             "vy_mps" if vehicle["parts"] else "speed_mps"
-        )  # the kinematic one is aimed at as if it went ahead
+        )  # balls are aimed at a kinematic vehicle as if it flew straight ahead
         state = tuple(float(vehicle[name]) for name in ("x_m", "y_m", "vx_mps", ahead))
         moving.throw(1e-6 * start_us, state)
         span_s = 1e-6 * start_us, 1e-6 * end_us
@@ -272,22 +272,22 @@ class Vehicles:
             sensor.move_bodies(moving.bodies, *span_s)
 
     def _set_task(self, row: int, name: str) -> None:
-        """Begin an episode of a task."""
+        """Set the task of a new episode."""
         judge = task.judge_of(name)
         self._judges.pop(row, None)
         if judge is not None:
             self._judges[row] = judge
 
     def _judge(self, active: np.ndarray) -> None:
-        """Judge the last step of the active vehicles whose task is not the corridor's."""
+        """Judge the last step of the active vehicles whose task is not "corridor"."""
         for judge in set(self._judges.values()):
             own = [self._judges.get(row) is judge for row in range(len(self.rows))]
             task.loop_over(judge)(self.rows, active & own)
 
     def _exchange(self, actions: np.ndarray, active: np.ndarray) -> np.ndarray:
-        """Queue the new decisions; return the decisions that each vehicle's delay makes due."""
+        """Queue the new decisions; return the decisions that are due now, given each vehicle's delay."""
         rows = self.rows
-        if not self._decided.shape[1]:  # none has ever been delayed
+        if not self._decided.shape[1]:  # no vehicle has had a delay so far
             return actions
         late = np.flatnonzero(active & (rows["delay"] > 0))
         turn, taken = rows["steps"][late] % rows["delay"][late], actions.copy()
@@ -296,7 +296,7 @@ class Vehicles:
         return taken
 
     def _set_filter(self, row: int, config: EnvConfig) -> None:
-        """Begin the episode's neighbour filter, if it has one."""
+        """Start the neighbour filter of an episode, if it has one."""
         self._support[row], self._tau_us[row] = config.filter_support, config.filter_tau_us
         if config.filter_support > 0:
             shape = config.camera.height + 2, config.camera.width + 2
@@ -307,7 +307,7 @@ class Vehicles:
             self._last_us[row] = NEVER
 
     def _sense(self, row: int, events: np.ndarray) -> np.ndarray:
-        """Complete the events of a step that the compiled call does not simulate to the end."""
+        """Return the events of a step that the compiled call did not simulate completely."""
         vehicle, sensor = self.rows[row], self._sensors[row]
         assert sensor is not None  # noqa: S101  for the type checker
         start_us, t_us = int(vehicle["start_us"]), int(vehicle["t_us"])

@@ -1,1 +1,1 @@
-"""From numbers to what a person reads: statistics, tables, plots and videos."""
+"""Presentation of results: statistics, tables, plots and videos."""

@@ -8,7 +8,7 @@ INK, MUTED, GRID = "#1f2430", "#6b7280", "#e5e7eb"
 BLACK, SLATE = "#111827", "#64748b"
 BLUE, CYAN, GREEN, LIME = "#2563eb", "#0891b2", "#059669", "#65a30d"
 AMBER, BROWN, RED, PINK, PURPLE, VIOLET = "#d97706", "#b45309", "#dc2626", "#db2777", "#7c3aed", "#9333ea"
-GREYS = ("#9ca3af", "#6b7280", "#374151", "#111827")  # of what is shown for comparison, from light to dark
+GREYS = ("#9ca3af", "#6b7280", "#374151", "#111827")  # for comparisons, from light to dark
 EVENTS = np.array([OFF_RGB, (21, 24, 31), ON_RGB])  # OFF, no event, ON
 # Colours by what is drawn.
 COLOURS = {
@@ -25,8 +25,8 @@ COLOURS = {
     "occupancy": BLUE, "signed": AMBER, "aged": GREEN, "counts": PINK, "proximity": SLATE,
     "reference": BLUE, "frame": AMBER, "legacy": RED,
 }  # fmt: skip
-# Colour and marker of each group of policies: Okabe and Ito's colours, which the colour-blind tell apart
-# too, without the yellow; then of the baselines, and of groups that have no look of their own.
+# Colour and marker of each group of policies: Okabe and Ito's colours, which colour-blind readers can
+# distinguish, without the yellow. Then the styles of baselines, and of groups without their own style.
 GROUP_STYLES = {
     "bytestream": ("#0072b2", "o"), "bytestream_xy": ("#56b4e9", "s"), "event_columns": ("#009e73", "^"),
     "event_set": ("#000000", "D"), "event_image": ("#d55e00", "v"), "event_image_vae": ("#e69f00", "P"),
@@ -40,4 +40,4 @@ BASELINE_STYLES = {
     "random": ("#c4c9d1", "."),
 }
 OTHER_STYLES = (("#8c564b", "p"), ("#a6761d", "*"), ("#4b5563", "d"))
-TAUGHT = "taught_"  # before the name of a kind: the group of +exp=taught
+TAUGHT = "taught_"  # prefix of a kind's name in the groups of +exp=taught

@@ -1,4 +1,4 @@
-"""The film of a recorded episode: camera, events, latent, choice, and the way from above."""
+"""The film of a recorded episode: camera, events, latent, actions, and the trajectory from above."""
 
 import functools
 from pathlib import Path
@@ -14,11 +14,11 @@ from jobs.rollout.episodes import outcome_of
 from jobs.rollout.recorded import Moment, RecordedEpisode
 
 WIDTH, SIDE, GAP, HEAD, LINE = 1248, 320, 16, 44, 26  # pixels
-MARGIN_M, SIDES_M = 2.0, 14.0  # shown before start and behind goal; beside the way
-TOP = HEAD + LINE + SIDE + LINE + GAP // 2  # of the plan
+MARGIN_M, SIDES_M = 2.0, 14.0  # shown before start and behind goal; on both sides of the trajectory
+TOP = HEAD + LINE + SIDE + LINE + GAP // 2  # top of the plan
 SLOWER, MAX_FPS, MIN_FPS = 4, 50, 10
 FRAMES_PER_FLIGHT_S = 100  # at most; more take longer to draw and show no more
-HEADINGS = (("left", 1), ("forward", 0), ("right", 2))  # as a person looks, with their numbers
+HEADINGS = (("left", 1), ("forward", 0), ("right", 2))  # actions from left to right, with their numbers
 TEXT, DIM, WALL, TRAIL, CHOSEN = "#f1f5f9", "#94a3b8", "#64748b", "#38bdf8", "#f59e0b"
 GROUND, OBSTACLE, GOAL = "#15181f", "#cbd5e1", "#34d399"
 FONT, SMALL = ImageFont.load_default(18), ImageFont.load_default(15)
@@ -26,9 +26,9 @@ Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
 Box = tuple[int, int, int, int]  # left, top, width, height
 
 
-@functools.lru_cache(maxsize=1024)  # of the texts of a film most are the same in every frame
+@functools.lru_cache(maxsize=1024)  # most texts of a film are the same in every frame
 def _written(text: str, font: Font, anchor: str) -> tuple[Image.Image, int, int]:
-    """Return a text as a mask, and the offset of its left and top from its anchor [pixels]."""
+    """Return a text as a mask, and the offsets of the mask's left and top from the anchor [pixels]."""
     left, top, right, bottom = (round(edge) for edge in font.getbbox(text, anchor=anchor))
     mask = Image.new("L", (right - left, bottom - top))
     ImageDraw.Draw(mask).text((-left, -top), text, 255, font, anchor)
@@ -43,19 +43,19 @@ def _write(
     font: Font,
     anchor: str,
 ) -> None:
-    """Write a text on a picture, where Pillow's `ImageDraw.text` would."""
+    """Write a text on a picture, at the same place as Pillow's `ImageDraw.text`."""
     mask, left, top = _written(text, font, anchor)
     picture.paste(colour, (round(at[0]) + left, round(at[1]) + top), mask)
 
 
 def write_film(path: Path, recorded: RecordedEpisode, title: str, decode: Decode | None) -> Path:
-    """Write an MP4 file of an episode, a frame for each step or for every second, third and so on; return it.
+    """Write an MP4 file of an episode, with a frame for every step or every n-th step; return the file.
 
     Args:
         path: The file.
         recorded: The episode.
-        title: Whose episode it is.
-        decode: Event window -> picture in [-1, 1], float (H, W), of a panel of its own; None: there is none.
+        title: Text at the top.
+        decode: Event window -> picture in [-1, 1], float (H, W), for an additional panel; None: no panel.
     """
     control_hz, last = recorded.env.control_hz, len(recorded.moments) - 1
     stride = max(1, round(control_hz / FRAMES_PER_FLIGHT_S))
@@ -76,19 +76,19 @@ def _pace(slower: float) -> str:
 
 
 def _scale(recorded: RecordedEpisode) -> float:
-    """Pixels of the plan per metre."""
+    """Return the scale of the plan [pixels/m]."""
     return WIDTH / (recorded.scene.length_m + 2 * MARGIN_M)
 
 
 def _shown_m(recorded: RecordedEpisode) -> tuple[float, float]:
-    """Return the range of x that the plan shows [m]: the surroundings of the way, at most up to the walls."""
+    """Return the range of x on the plan [m]: `SIDES_M` around the trajectory, at most up to the walls."""
     x_m = [moment.x_m for moment in recorded.moments]
     wall_m = 0.5 * recorded.scene.width_m + MARGIN_M
     return max(-wall_m, min(x_m) - SIDES_M), min(wall_m, max(x_m) + SIDES_M)
 
 
 def _on_plan(recorded: RecordedEpisode, xy_m: np.ndarray) -> list[tuple[float, float]]:
-    """Return where points (N, 2) [m] of the corridor are drawn: forward is right, right is down."""
+    """Return the pixels of points (N, 2) [m] on the plan: forward is right, right is down."""
     scale, (first_m, _) = _scale(recorded), _shown_m(recorded)
     x_m, y_m = np.atleast_2d(xy_m).T
     across, down = (y_m + MARGIN_M) * scale, TOP + (x_m - first_m) * scale
@@ -111,7 +111,7 @@ def _background(recorded: RecordedEpisode, title: str) -> Image.Image:
     for side_m in (-half_m, half_m):
         draw.line(_on_plan(recorded, np.array([(side_m, 0.0), (side_m, goal_m)])), WALL, 3)
     draw.line(_on_plan(recorded, np.array([(-half_m, goal_m), (half_m, goal_m)])), GOAL, 3)
-    draw.rectangle((0, 0, WIDTH, TOP - 1), INK)  # obstacles beside the shown part too
+    draw.rectangle((0, 0, WIDTH, TOP - 1), INK)  # covers obstacles outside the plan
     _write(picture, (GAP, HEAD // 2), title, TEXT, FONT, "lm")
     _write(
         picture, (GAP, TOP - LINE // 2), "from above: start on the left, goal on the right", DIM, SMALL, "lm"
@@ -125,10 +125,10 @@ def _frame(
     places: tuple[int, int],
     shown: tuple[Decode | None, float],
 ) -> Image.Image:
-    """Draw one moment; the way so far stays on the canvas.
+    """Draw one moment; the trajectory so far stays on the canvas.
 
-    `places` are the moment drawn before and this one, `shown` what draws the latent's picture, if anything,
-    and the size of a full bar of the latent.
+    `places` are the indices of the previous moment and this one. `shown` has the decoder of the latent, or
+    None, and the latent's value at a full bar.
     """
     (first, place), (decode, largest) = places, shown
     moment, moments = recorded.moments[place], recorded.moments
@@ -154,7 +154,7 @@ def _frame(
 
 
 def _panels(moment: Moment, decode: Decode | None) -> list[tuple[str, np.ndarray]]:
-    """Name and picture, uint8 (H, W, 3), of each panel."""
+    """Return name and picture, uint8 (H, W, 3), of each panel."""
     panels = [("camera", np.repeat(grey_picture(moment.luminance)[:, :, None], 3, axis=2))]
     if moment.events is not None:
         name = f"events of this step: {moment.num_events} (blue ON, orange OFF)"
@@ -189,7 +189,7 @@ def _draw_choice(picture: Image.Image, box: Box, moment: Moment) -> None:
 
 
 def _draw_choices(picture: Image.Image, box: Box, moment: Moment) -> None:
-    """Draw the probability of each of many actions as bars upwards, from the left to the right command."""
+    """Draw the probabilities of many actions as vertical bars, from the left to the right command."""
     draw, (left, top, width, height) = ImageDraw.Draw(picture), box
     bottom, pitch = top + height - LINE, width / moment.probabilities.size
     for action, share in enumerate(moment.probabilities.tolist()):
@@ -201,7 +201,7 @@ def _draw_choices(picture: Image.Image, box: Box, moment: Moment) -> None:
 
 
 def _draw_latent(picture: Image.Image, box: Box, latent: np.ndarray, largest: float) -> None:
-    """Draw each number of the latent as a bar up or down; `largest` is the size of a full bar."""
+    """Draw each number of the latent as a bar up or down; `largest` is the value at a full bar."""
     draw, (left, top, width, height) = ImageDraw.Draw(picture), box
     text = f"latent: the {len(latent)} numbers that the policy sees of the events"
     _write(picture, (left, top + LINE // 2), text if width > 400 else "latent", DIM, SMALL, "lm")

@@ -1,4 +1,4 @@
-"""Obstacles from above, as shapes that any drawing takes."""
+"""Obstacles seen from above, as circles and rectangles for drawings."""
 
 import numpy as np
 
@@ -6,11 +6,11 @@ from envs.scene import Scene
 
 
 def ground_plan(scene: Scene, height_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return what a vehicle at a height can hit, except the walls.
+    """Return the obstacles that a vehicle at a height can hit, without the walls.
 
     Args:
         scene: The corridor.
-        height_m: Of the vehicle above the ground [m].
+        height_m: Height of the vehicle above the ground [m].
 
     Returns:
         Circles as rows x, y, radius (C, 3) [m]; corners x, y of rectangles (R, 4, 2) [m].

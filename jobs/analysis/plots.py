@@ -1,4 +1,4 @@
-"""Plots of results: trajectories from above, event pictures, learning curves; the colours of all plots."""
+"""Plots of results: trajectories from above, event pictures and learning curves; the styles of groups."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -33,7 +33,7 @@ EVENT_COLOURS = LinearSegmentedColormap.from_list("events", EVENTS / 255.0)
 
 
 def style_of(group: str) -> tuple[str, str]:
-    """Colour and marker of a group, the same in every plot; a taught kind looks as its kind, but paler."""
+    """Return a group's colour and marker, the same in every plot; a taught kind has its kind's, but paler."""
     kind = group.removeprefix(TAUGHT)
     if kind != group and kind in GROUP_STYLES:
         colour, marker = GROUP_STYLES[kind]
@@ -45,7 +45,7 @@ def style_of(group: str) -> tuple[str, str]:
 
 
 def tidy(panel: Axes, grid: str = "both") -> None:
-    """Draw a light grid along the named axis or "both", and no frame above and to the right."""
+    """Draw a light grid along an axis or "both", and remove the frame at the top and on the right."""
     panel.grid(axis=grid, color=GRID)  # type: ignore[arg-type]
     panel.spines[["top", "right"]].set_visible(False)
 
@@ -59,7 +59,7 @@ def panel_grid(
         count: Panels.
         max_across: Panels side by side.
         size: Width and height of a panel [inches].
-        margin: Width and height beside all panels [inches].
+        margin: Width and height that the figure has in addition to the panels [inches].
         **shared: Arguments of `Figure.subplots`, such as sharex.
     """
     across = min(max_across, count)
@@ -73,14 +73,14 @@ def panel_grid(
 
 
 def plot_reconstructions(targets: np.ndarray, pictures: np.ndarray) -> Figure:
-    """Draw event pictures above what the event VAE decodes of them.
+    """Draw event pictures above their reconstructions by the event VAE.
 
     Args:
         targets: Event pictures, shape (N, H, W), in [-1, 1] or [0, 1].
         pictures: Their reconstructions, same shape.
 
     Raises:
-        ValueError: If the shapes differ or there is nothing to show.
+        ValueError: The shapes differ, or there are no pictures.
     """
     if targets.shape != pictures.shape or targets.ndim != 3 or len(targets) == 0:
         raise ValueError(f"pictures must be (N, H, W) as targets, got {pictures.shape} and {targets.shape}")
@@ -105,7 +105,7 @@ def plot_reconstructions(targets: np.ndarray, pictures: np.ndarray) -> Figure:
 
 
 def plot_trajectories(tracks: Sequence[Trajectory]) -> Figure:
-    """Draw trajectories from above, one corridor per seed; a policy's has the colour of its outcome."""
+    """Draw trajectories from above, a panel per corridor; the policy's are coloured by outcome."""
     seeds = list(dict.fromkeys(track.seed for track in tracks))
     height = 0.4 + 6.0 * (max(track.scene.width_m for track in tracks) + 2) / 104
     figure, panels = panel_grid(len(seeds), 2, (6.6, height), (0.0, 0.6), sharex=True, sharey=True)
@@ -127,7 +127,7 @@ def plot_trajectories(tracks: Sequence[Trajectory]) -> Figure:
 
 
 def _draw_scene(panel: Axes, scene: Scene, height_m: float) -> None:
-    """Draw walls, goal line and obstacles; the agent's right is down."""
+    """Draw walls, goal line and obstacles; the vehicle's right is down."""
     half = scene.width_m / 2
     circles, corners = ground_plan(scene, height_m)
     shapes: list[Patch] = [Circle((y, x), radius) for x, y, radius in circles]
@@ -163,7 +163,7 @@ class Curve:
 def plot_learning_curves(curves: Sequence[Curve]) -> Figure:
     """Draw success in training against steps: a line for each experiment, the mean of its trainings.
 
-    The mean is drawn where every training has a point before and after; the legend names its end, best first.
+    A line spans the steps that all trainings have in common. The legend has the final means, best first.
     """
     figure = Figure(figsize=(9.0, 4.6), layout="constrained")
     panel = figure.subplots()

@@ -1,8 +1,8 @@
 """95 % intervals of a rate, of a mean, over several trainings, and of a difference on the same corridors.
 
-What is replicated is the training: every training is evaluated in the same corridors, a crossed design of
-two random factors. scipy computes what it can; it has no interval of a mean over two crossed factors, and
-none of a difference of paired rates. `python -m research.coverage` prints how often the intervals hold.
+The unit of replication is the training. All trainings are evaluated in the same corridors, a crossed design
+of two random factors. scipy is used where possible; it has no interval of a mean over two crossed factors,
+and none of a difference of paired rates. `python -m research.coverage` prints the intervals' coverage.
 """
 
 import importlib
@@ -15,32 +15,32 @@ import numpy as np
 CONFIDENCE = 0.95
 RESAMPLES = 10_000
 POWER = 0.8
-MOST_TRAININGS = 10_000  # beyond which no study is planned
-CERTAIN = 30.0  # standard errors beyond which power is 1, and scipy's noncentral t has no digits
+MOST_TRAININGS = 10_000  # limit of the search in `trainings_needed`
+CERTAIN = 30.0  # standard errors, beyond which power is 1 and scipy's noncentral t has no correct digits
 
 Interval = tuple[float, float]
 
 
 def _stats() -> ModuleType:
-    """Import scipy.stats, which takes half a second, and which a demo from the wheel does without."""
+    """Import scipy.stats on demand: it takes half a second, and a demo from the wheel works without it."""
     return importlib.import_module("scipy.stats")
 
 
 class Estimate(NamedTuple):
-    """A value with its 95 % interval; None where a single episode leaves nothing to resample."""
+    """A value with its 95 % interval; None for a single episode."""
 
     value: float
     interval: Interval | None
 
 
 class Difference(NamedTuple):
-    """A value that may be 0, its 95 % interval, and the two-sided p of the test that it is 0.
+    """A value, its 95 % interval, and the two-sided p value of the test that the value is 0.
 
-    Interval and p are None where a single episode leaves nothing to compare.
+    Interval and p are None if there are too few trainings and corridors for a test.
 
     Attributes:
-        error: Standard error; None where interval and p are.
-        freedom: Its degrees of freedom.
+        error: Standard error; None if interval and p are.
+        freedom: Degrees of freedom of the standard error.
     """
 
     value: float
@@ -50,7 +50,7 @@ class Difference(NamedTuple):
     freedom: float | None = None
 
     def p_of_gain(self, margin: float) -> float | None:
-        """Return the one-sided p of the test that the value is `margin` or more; small excludes a gain."""
+        """Return the one-sided p of the test that the value is `margin` or more; small p excludes a gain."""
         if self.error is None:
             return None
         if self.error == 0.0:
@@ -58,15 +58,15 @@ class Difference(NamedTuple):
         return float(_stats().t.sf((margin - self.value) / self.error, self.freedom))
 
     def p_of_loss(self, margin: float) -> float | None:
-        """Return the one-sided p of the test that the value is `-margin` or less; small excludes a loss."""
+        """Return the one-sided p of the test that the value is `-margin` or less; small p excludes a loss."""
         return self._replace(value=-self.value).p_of_gain(margin)
 
 
 def wilson_interval(successes: int, trials: int) -> Interval:
-    """95 % interval of a success rate (Wilson 1927); it also holds at 0 and at all of them.
+    """Return the 95 % interval of a success rate (Wilson 1927), which is also valid at 0 and 1.
 
     Raises:
-        ValueError: If there are no trials, or more successes than trials.
+        ValueError: There are no trials, or more successes than trials.
     """
     if not 0 <= successes <= trials or trials < 1:
         raise ValueError(f"need 0 <= successes <= trials and a trial, got {successes} of {trials}")
@@ -75,14 +75,14 @@ def wilson_interval(successes: int, trials: int) -> Interval:
 
 
 def bootstrap_interval(values: np.ndarray, rng: np.random.Generator) -> Interval | None:
-    """95 % percentile bootstrap interval of the mean; None for a single value.
+    """Return the 95 % percentile bootstrap interval of the mean; None for a single value.
 
     Args:
         values: One number per episode, shape (n,).
         rng: Draws the resamples.
 
     Raises:
-        ValueError: If there is no value, or one is NaN or infinite.
+        ValueError: There is no value, or a value is NaN or infinite.
     """
     values = np.asarray(values, dtype=np.float64)
     if values.ndim != 1 or values.size == 0 or not np.isfinite(values).all():
@@ -95,18 +95,18 @@ def bootstrap_interval(values: np.ndarray, rng: np.random.Generator) -> Interval
 
 
 def rate_estimate(successes: np.ndarray) -> Estimate:
-    """Success rate over trainings and corridors; trainings are what is replicated.
+    """Estimate the success rate over trainings and corridors; the training is the unit of replication.
 
-    The interval reaches as far as the farthest of three: Student's of the training means with what the
-    corridors add (`crossed_mean`), the same of their arcsines (Anscombe 1948), which fits rates near 0 and 1,
-    and Wilson's of all episodes, without which trainings that agree would leave no doubt. How often it holds
-    the true rate: `python -m research.coverage`.
+    The interval spans three: Student's of the training means with the corridors' variance (`crossed_mean`),
+    Student's of the trainings' arcsines (Anscombe 1948), which fits rates near 0 and 1, and Wilson's of all
+    episodes, without which trainings that agree would give an interval of width 0. Coverage:
+    `python -m research.coverage`.
 
     Args:
         successes: Shape (trainings, corridors), 0 or 1.
 
     Raises:
-        ValueError: If there is no value, or one is NaN or infinite.
+        ValueError: There is no value, or a value is NaN or infinite.
     """
     successes = _checked(successes, "successes")
     trainings, corridors = successes.shape
@@ -123,29 +123,30 @@ def rate_estimate(successes: np.ndarray) -> Estimate:
 
 
 def crossed_mean(values: np.ndarray, bounds: Interval | None = None) -> Difference:
-    """Mean over trainings and corridors, and the test that it is 0; both are drawn at random, and crossed.
+    """Estimate the mean over trainings and corridors, two crossed random factors, and test if it is 0.
 
-    Student's interval of the training means, widened by what the corridors add to their scatter (the analysis
-    of variance of a crossed design; degrees of freedom as Satterthwaite 1946, those of the trainings at
-    most). A single training says nothing of others: the interval is then over corridors.
+    The interval is Student's of the training means, widened by the variance that the corridors add (analysis
+    of variance of a crossed design; degrees of freedom by Satterthwaite 1946, at most the trainings'). With a
+    single training, the interval is over corridors, for this training alone.
 
     Args:
         values: Shape (trainings, corridors).
-        bounds: The least and the greatest value that there can be. Where values agree by chance, one of each
-            is added to find how sure that is. None: there are none, and values that agree leave no doubt.
+        bounds: Smallest and largest possible value. One value at each bound is added when the variance by
+            chance is estimated, because values can agree by chance. None: no bounds; equal values give an
+            interval of width 0.
 
     Raises:
-        ValueError: If there is no value, or one is NaN or infinite.
+        ValueError: There is no value, or a value is NaN or infinite.
     """
     values = _checked(values, "values")
     return _within(_crossed([values], _least(values, bounds)), bounds)
 
 
 def crossed_difference(ours: np.ndarray, theirs: np.ndarray, bounds: Interval | None = None) -> Difference:
-    """Mean of ours minus mean of theirs, of other trainings in the same corridors, and the test that it is 0.
+    """Estimate the mean of ours minus the mean of theirs in the same corridors, and test if it is 0.
 
-    Welch's interval of the training means, widened as in `crossed_mean`. Where a side has one training, the
-    interval is over corridors, for these trainings alone.
+    The interval is Welch's of the training means, widened as in `crossed_mean`. If a side has one training,
+    the interval is over corridors, for these trainings alone.
 
     Args:
         ours: Shape (trainings, corridors).
@@ -153,7 +154,7 @@ def crossed_difference(ours: np.ndarray, theirs: np.ndarray, bounds: Interval | 
         bounds: As in `crossed_mean`.
 
     Raises:
-        ValueError: If the corridors are not as many, or a value is NaN or infinite.
+        ValueError: The numbers of corridors differ, or a value is NaN or infinite.
     """
     ours, theirs = _checked(ours, "ours"), _checked(theirs, "theirs")
     if ours.shape[1] != theirs.shape[1]:
@@ -164,7 +165,7 @@ def crossed_difference(ours: np.ndarray, theirs: np.ndarray, bounds: Interval | 
 
 
 def _within(found: Difference, bounds: Interval | None) -> Difference:
-    """Return the difference with an interval that ends at the bounds, if there are any."""
+    """Clip the interval of a difference to the bounds, if there are any."""
     if bounds is None or found.interval is None:
         return found
     low, high = found.interval
@@ -172,12 +173,15 @@ def _within(found: Difference, bounds: Interval | None) -> Difference:
 
 
 def _by_trainings(values: np.ndarray) -> float:
-    """Variance of the mean by its trainings and by chance; 0 for a single training."""
+    """Return the variance of the mean due to trainings and chance; 0 for a single training."""
     return float(values.mean(axis=1).var(ddof=1) / len(values)) if len(values) > 1 else 0.0
 
 
 def _by_corridors(sides: Sequence[np.ndarray]) -> float:
-    """Variance that corridors add to the sum of the sides' means; of a single training, with chance."""
+    """Return the variance that corridors add to the sum of the sides' means.
+
+    If a side has a single training, the variance includes chance.
+    """
     corridors = sides[0].shape[1]
     if corridors == 1:
         return 0.0
@@ -187,22 +191,22 @@ def _by_corridors(sides: Sequence[np.ndarray]) -> float:
 
 
 def _residual(values: np.ndarray) -> float:
-    """Variance of the mean by what neither trainings nor corridors explain."""
+    """Return the variance of the mean that neither trainings nor corridors explain."""
     trainings, corridors = values.shape
     rest = values - values.mean(axis=0) - values.mean(axis=1, keepdims=True) + values.mean()
     return float((rest**2).sum() / ((trainings - 1) * (corridors - 1)) / values.size)
 
 
 def _least(values: np.ndarray, bounds: Interval | None, size: int | None = None) -> float:
-    """Variance of the mean by chance alone, with one value more at each bound; 0 without bounds.
+    """Return the variance of the mean by chance alone, with one more value at each bound; 0 without bounds.
 
-    As Agresti and Coull (1998) add a success and a failure to a rate; what trainings and corridors explain is
-    no chance, so that pairs of episodes in a corridor stay pairs.
+    Agresti and Coull (1998) add a success and a failure to a rate in the same way. Variance that trainings
+    and corridors explain does not count as chance, so episodes in the same corridor stay paired.
 
     Args:
-        values: Of one group, (trainings, corridors).
+        values: Values of one group, (trainings, corridors).
         bounds: As in `crossed_mean`.
-        size: Of so many values that scatter as these do; None: of these.
+        size: Number of values with the same variance by chance; None: the number of `values`.
     """
     if bounds is None:
         return 0.0
@@ -212,9 +216,9 @@ def _least(values: np.ndarray, bounds: Interval | None, size: int | None = None)
 
 
 def _crossed(sides: Sequence[np.ndarray], least: float) -> Difference:
-    """Student's interval and two-sided test of the sum of the sides' means, crossed with their corridors.
+    """Return the sum of the sides' means with Student's interval and two-sided test, over crossed corridors.
 
-    Where a side has one training, the degrees of freedom are those of the corridors; None without any.
+    If a side has one training, the degrees of freedom are the corridors'; without any, there is no interval.
 
     Args:
         sides: Each of shape (trainings, corridors).
@@ -240,11 +244,11 @@ def _error(parts: Sequence[tuple[float, int]], least: float, most: int) -> tuple
     """Return the standard error and its degrees of freedom, combined as by Welch and Satterthwaite.
 
     Args:
-        parts: Parts of the variance with their degrees of freedom; what has none is left out.
-        least: Variance that there is at least.
-        most: Degrees of freedom that there are at most, and of what `least` adds: those of the trainings.
-            Without this limit small p values come two or three times too often with three trainings, whose
-            scatter looks small by chance beside that of corridors.
+        parts: Parts of the variance with their degrees of freedom; parts without any are ignored.
+        least: Smallest variance.
+        most: Largest degrees of freedom, the trainings'; also used for what `least` adds. Without this limit,
+            small p values come two or three times too often with three trainings, whose variance can be
+            small by chance, compared with the corridors'.
     """
     known = [(part, freedom) for part, freedom in parts if freedom > 0]
     known.append((max(least - sum(part for part, _ in known), 0.0), most))
@@ -256,13 +260,13 @@ def _error(parts: Sequence[tuple[float, int]], least: float, most: int) -> tuple
 
 
 def exact_pair_p(ours: np.ndarray, theirs: np.ndarray) -> float:
-    """Two-sided p of two policies' successes bool (n,) in the same corridors (McNemar's exact test)."""
+    """Return McNemar's exact two-sided p of two policies' successes, bool (n,), in the same corridors."""
     won, lost = int((ours > theirs).sum()), int((ours < theirs).sum())
     return float(_stats().binomtest(won, won + lost).pvalue) if won + lost else 1.0
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """Adjust p values so that one below 0.05 is wrong in at most 5 % of such families (Holm 1979)."""
+    """Adjust p values so that at most 5 % of such families have a wrong one below 0.05 (Holm 1979)."""
     order = np.argsort(p_values)
     scaled = np.array(p_values)[order] * np.arange(len(order), 0, -1)
     adjusted = np.empty(len(order))
@@ -273,21 +277,21 @@ def holm(p_values: Sequence[float]) -> list[float]:
 def trainings_needed(
     ours: np.ndarray, theirs: np.ndarray, gain: float, family: int = 1, bounds: Interval | None = None
 ) -> int | None:
-    """Compute how many trainings of each side show a difference of `gain` in four of five studies.
+    """Compute how many trainings per side detect a difference of `gain` in four of five studies (`POWER`).
 
-    The power of the test of `crossed_difference` (noncentral t), in as many corridors as these; it must also
-    pass the first step of Holm's adjustment, so that the number suffices whatever the other tests say.
+    Power is that of the test of `crossed_difference` (noncentral t) in the same number of corridors. The test
+    must pass the first step of Holm's adjustment, so the number is enough whatever the other tests give.
 
     Args:
         ours: Shape (trainings, corridors).
         theirs: Shape (other trainings, the same corridors).
         gain: Difference of the means.
-        family: Tests that are adjusted together.
+        family: Number of tests that are adjusted together.
         bounds: As in `crossed_difference`.
 
     Returns:
-        None where a side has one training, of which no spread is known, or no number of trainings is enough,
-        since what corridors add remains.
+        Trainings per side; None if a side has one training, whose spread is unknown, or if no number is
+        enough, because the variance that corridors add remains.
     """
     if min(len(ours), len(theirs)) < 2:
         return None
@@ -315,16 +319,16 @@ def trainings_needed(
 
 
 class Spread(NamedTuple):
-    """Standard deviations in a group: between its trainings, and of an episode of a training."""
+    """Standard deviations in a group: between its trainings, and between a training's episodes by chance."""
 
     trainings: float
     episodes: float
 
 
 def spread_of(values: np.ndarray) -> Spread:
-    """Both standard deviations, by analysis of variance of two crossed factors (method of moments).
+    """Estimate both standard deviations by analysis of variance of two crossed factors (method of moments).
 
-    What all trainings share in a corridor is no part of them. Where trainings differ less than single
+    They exclude effects of a corridor on all trainings. If trainings differ less than chance between
     episodes would make them differ, the first is 0.
 
     Args:
@@ -338,7 +342,7 @@ def spread_of(values: np.ndarray) -> Spread:
 def corridor_spread(ours: np.ndarray, theirs: np.ndarray) -> float:
     """Estimate the standard deviation between corridors of the difference of two groups, without chance.
 
-    What a corridor does to both alike is no part of it.
+    It excludes effects of a corridor on both groups alike.
 
     Args:
         ours: Shape (trainings, corridors).
@@ -348,17 +352,17 @@ def corridor_spread(ours: np.ndarray, theirs: np.ndarray) -> float:
 
 
 def expected_half_width(ours: Spread, theirs: Spread, apart: float, trainings: int, corridors: int) -> float:
-    """Half of the 95 % interval of the difference of two groups, in the unit of their spreads.
+    """Return half the width of the 95 % interval of the difference of two groups, in the spreads' unit.
 
     Args:
-        ours: Of one group.
-        theirs: Of the other.
+        ours: Spread of one group.
+        theirs: Spread of the other group.
         apart: `corridor_spread` of both.
-        trainings: Of each, two at least.
-        corridors: In which all are evaluated.
+        trainings: Number of trainings per group, at least two.
+        corridors: Number of corridors in which all are evaluated.
 
     Raises:
-        ValueError: There is only one training.
+        ValueError: There are less than two trainings.
     """
     if trainings < 2:
         raise ValueError(f"an interval over trainings needs two of them, got {trainings}")
@@ -374,10 +378,9 @@ class CrossedSpread(NamedTuple):
     """Standard deviations of the rows and the columns of a table, and the p of the tests that they are 0.
 
     Attributes:
-        rows, columns: Of what a row or a column has in common; 0 where the rest alone would make them differ
-            as much.
-        rest: Of what neither explains.
-        rows_p, columns_p: None: nothing differs at all.
+        rows, columns: Standard deviation of row or column effects; 0 if the residual alone explains as much.
+        rest: Standard deviation of the residual.
+        rows_p, columns_p: p values of the tests; None if no values differ.
     """
 
     rows: float
@@ -388,13 +391,13 @@ class CrossedSpread(NamedTuple):
 
 
 def crossed_spread(values: np.ndarray) -> CrossedSpread:
-    """Estimate which of two crossed factors values depend on (two-way analysis of variance, F tests).
+    """Estimate how values depend on two crossed factors (two-way analysis of variance, F tests).
 
     Args:
-        values: Shape (rows, columns), two of each at least.
+        values: Shape (rows, columns), at least two of each.
 
     Raises:
-        ValueError: There are fewer, or a value is NaN or infinite.
+        ValueError: There are fewer rows or columns, or a value is NaN or infinite.
     """
     values = _checked(values, "values")
     if min(values.shape) < 2:
@@ -406,7 +409,7 @@ def crossed_spread(values: np.ndarray) -> CrossedSpread:
 
 
 def _factor(values: np.ndarray, rest: float) -> tuple[float, float | None]:
-    """Return the standard deviation of the rows, and the p of its test, by the variance of the rest."""
+    """Return the standard deviation of the rows, and the p of its test against the residual variance."""
     rows, columns = values.shape
     between = columns * float(values.mean(axis=1).var(ddof=1))
     spread = float(np.sqrt(max(between - rest, 0.0) / columns))
@@ -416,10 +419,10 @@ def _factor(values: np.ndarray, rest: float) -> tuple[float, float | None]:
 
 
 def half_width(values: np.ndarray) -> np.ndarray:
-    """Half of the 95 % interval (Student's t) of the mean over trainings at each of k points: (k,).
+    """Return half the width of the 95 % interval (Student's t) of the mean over trainings at k points, (k,).
 
     Args:
-        values: Shape (trainings, k), two trainings at least.
+        values: Shape (trainings, k), at least two trainings.
 
     Raises:
         ValueError: There is only one training.

@@ -28,15 +28,15 @@ SUMMARY_HEADINGS = ("Episodes", "Success [%]", "Distance [m]", "Events/step", "D
 
 @dataclass(frozen=True)
 class Summary:
-    """What an agent achieved over the episodes of one condition.
+    """Results of an agent over the episodes of one condition.
 
     Attributes:
         label: What was evaluated, one word per heading of the table.
         episodes: Number of episodes [-].
         success: Fraction that reached the goal line, with its Wilson interval.
         distance_m: Mean forward distance without collision [m], with its bootstrap interval.
-        events_per_step: Mean events of a control step [-]; 0 for an agent that sees none.
-        dropped: Events that did not fit into a window or a pixel, all episodes [-].
+        events_per_step: Mean number of events per control step [-]; 0 for an agent that sees none.
+        dropped: Number of events in all episodes that did not fit into a window or a pixel [-].
     """
 
     label: tuple[str, ...]
@@ -48,9 +48,9 @@ class Summary:
 
 
 def summarise(label: Sequence[str], episodes: np.ndarray) -> Summary:
-    """Rates, means and intervals of the episodes (dtype `jobs.rollout.episodes.EPISODE`) of one condition.
+    """Summarise the episodes (dtype `jobs.rollout.episodes.EPISODE`) of one condition.
 
-    The resamples are drawn from a fixed seed: the same episodes give the same interval.
+    The seed of the resamples is fixed: the same episodes give the same interval.
     """
     success, distance_m = episodes["success"], episodes["distance_m"].astype(np.float64)
     return Summary(
@@ -69,7 +69,7 @@ def estimate_text(estimate: Estimate | Difference | None, scale: float = 1, form
     """Format a value with its interval, such as "84 [76, 90]"; "-" for None."""
     if estimate is None:
         return "-"
-    form = form.replace("+", "+z") if form.startswith("+") else f"z{form}"  # what rounds to 0 has no minus
+    form = form.replace("+", "+z") if form.startswith("+") else f"z{form}"  # no minus before a rounded 0
     ends = ", ".join(format(scale * end, form) for end in estimate.interval or ())
     return f"{scale * estimate.value:{form}}" + (f" [{ends}]" if ends else "")
 
@@ -80,12 +80,12 @@ def percent_text(estimate: Estimate) -> str:
 
 
 def short(value: float) -> str:
-    """Format a number with two significant digits, in whole numbers from 10 on."""
+    """Format a number with two significant digits, from 10 on as a whole number."""
     return f"{value:,.0f}" if abs(value) >= 10 else f"{value:.2g}"
 
 
 def events_texts(events_per_step: float, dropped: int) -> tuple[str, str]:
-    """Format both counts; "-" for an agent that sees no events, for which none were made."""
+    """Format both counts; "-" for an agent that sees no events, because none are simulated."""
     return (f"{events_per_step:.0f}", str(dropped)) if events_per_step > 0 else ("-", "-")
 
 
@@ -96,7 +96,7 @@ def summary_cells(row: Summary) -> tuple[str, ...]:
 
 
 def summary_columns(names: Sequence[str], rows: Sequence[Summary]) -> dict[str, list[str | float]]:
-    """Return the columns of a tracker's table; the first, all words of the labels joined, is unique."""
+    """Return the columns of a tracker's table; the first has the joined labels, which are unique."""
     ends = [row.distance_m.interval or (row.distance_m.value,) * 2 for row in rows]
     return {
         " · ".join(names): [" · ".join(row.label) for row in rows],
@@ -131,7 +131,7 @@ def summary_metrics(row: Summary) -> dict[str, float]:
 
 
 def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]], words: int = 1) -> str:
-    """Rows of text as a Markdown table; all but the first `words` columns are numbers."""
+    """Format rows of text as a Markdown table; all but the first `words` columns are numbers."""
     rules = ["---" if place < words else "---:" for place in range(len(head))]
     return "\n".join("| " + " | ".join(line) + " |" for line in (head, rules, *rows)) + "\n"
 
@@ -143,14 +143,14 @@ def show_table(
     words: int = 1,
     caption: str | None = None,
 ) -> None:
-    """Print rows of text as a table, in full width where there is no terminal.
+    """Print rows of text as a table, `FILE_WIDTH` characters wide if there is no terminal.
 
     Args:
-        title: What stands above it.
+        title: Text above the table.
         head: Headings.
-        rows: A text for each heading.
-        words: How many columns hold words and are aligned to the left; the others hold numbers.
-        caption: What stands below it.
+        rows: One text per heading.
+        words: Number of columns with words, which are aligned to the left; the others have numbers.
+        caption: Text below the table.
     """
     table = Table(title=title, caption=caption, title_justify="left")
     for place, name in enumerate(head):
@@ -178,7 +178,7 @@ def publish_table(
 
 
 def write_csv(file: Path, head: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
-    """Write rows below their headings as a CSV file; None is nothing."""
+    """Write rows below their headings as a CSV file; None is an empty cell."""
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows([head, *rows])
     write_atomic(file, text.getvalue())

@@ -1,4 +1,4 @@
-"""Films of episodes: what the camera sees, its events, and what the latents hold of them."""
+"""Films of episodes: luminance, events, and the pictures decoded from the latents."""
 
 import contextlib
 import re
@@ -25,14 +25,14 @@ from models.policy.policy import ENCODER
 ZOOM, GAP, BAR = 5, 12, 40
 FILM_FPS, FRAMES_PER_FLIGHT_S = 25, 50
 QUALITY = 7  # 0 to 10, best
-FRAMES = ("-map", "0:v:0", "-c", "copy", "-f", "null", "-")  # ffmpeg then counts them
+FRAMES = ("-map", "0:v:0", "-c", "copy", "-f", "null", "-")  # make ffmpeg count the frames
 
 Decode = Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass
 class Film:
-    """An MP4 file of one episode that is being written, see `open_film`."""
+    """The MP4 file of an episode while it is written; see `open_film`."""
 
     part: Path
     control_hz: float
@@ -45,7 +45,7 @@ class Film:
     def step(
         self, luminance: np.ndarray, events: np.ndarray | None, window: np.ndarray, caption: str
     ) -> None:
-        """Show a control step: its luminance (H, W), its EVENT array or None if none are made, its window."""
+        """Add a control step: luminance (H, W), EVENT array (None if none are simulated), and window."""
         self._recent.append(events)
         stride = max(1, round(self.control_hz / FRAMES_PER_FLIGHT_S))
         if len(self._recent) < stride:
@@ -61,7 +61,7 @@ class Film:
         self.add(frame(panels, f"{caption}   {slower:.0f}x slower" if slower > 1 else caption))
 
     def add(self, picture: np.ndarray) -> None:
-        """Show a picture, uint8 (H, W, 3), all of one size; its sides are even."""
+        """Add a picture, uint8 (H, W, 3); all pictures have the same even size."""
         if self._writer is None:
             self._writer = _start_writer(self.part, picture, self.fps)
         self._frames += 1
@@ -71,15 +71,15 @@ class Film:
             raise self._failure("fewer") from None
 
     def close(self) -> None:
-        """End the file."""
+        """Finish the file."""
         if self._writer is not None:
             self._writer.close()
 
     def check(self) -> None:
-        """Check that the file holds every frame, once it is closed: ffmpeg's errors are not passed on.
+        """Check that the closed file has every frame, because ffmpeg's errors are not passed on.
 
         Raises:
-            RunError: It does not.
+            RunError: Frames are missing.
         """
         held = frames_of(self.part) if self._frames else 0
         if held != self._frames:
@@ -93,16 +93,16 @@ class Film:
 
 @contextlib.contextmanager
 def open_film(path: Path, control_hz: float, decode: Decode | None, fps: float = FILM_FPS) -> Iterator[Film]:
-    """Write an MP4 file of one episode: luminance, events if there are any, what the latents hold if decoded.
+    """Write an MP4 file of one episode: luminance, any events, and any pictures decoded from the latents.
 
-    Frames of `Film.step` are `FRAMES_PER_FLIGHT_S` per second of flight. The file is written whole or not
+    `Film.step` adds `FRAMES_PER_FLIGHT_S` frames per second of flight. The file is written whole or not
     at all.
 
     Args:
         path: The file.
         control_hz: Control steps per second of flight [Hz].
-        decode: Event window -> picture in [-1, 1], float (H, W), of a third panel; None: there is none.
-        fps: Frames that are played per second [Hz].
+        decode: Event window -> picture in [-1, 1], float (H, W), for a third panel; None: no such panel.
+        fps: Frames played per second [Hz].
     """
     with replaced(path) as part:
         with contextlib.closing(Film(part, control_hz, decode, fps)) as film:
@@ -111,10 +111,10 @@ def open_film(path: Path, control_hz: float, decode: Decode | None, fps: float =
 
 
 def _start_writer(part: Path, picture: np.ndarray, fps: float) -> Generator[None, np.ndarray | None, None]:
-    """Start the ffmpeg program that imageio-ffmpeg brings, for frames of the size of `picture`."""
+    """Start imageio-ffmpeg's own ffmpeg for frames of the size of `picture`."""
     size = (picture.shape[1], picture.shape[0])
     look = {"codec": "libx264", "quality": QUALITY, "macro_block_size": 2}
-    # The name of an unfinished file does not say its format; x264's usual preset takes a third longer.
+    # An unfinished file's name does not show its format; x264's default preset takes a third longer.
     more = ["-f", "mp4", "-preset", "veryfast"]
     writer = imageio_ffmpeg.write_frames(
         str(part), size, fps=fps, ffmpeg_log_level="error", output_params=more, **look
@@ -124,7 +124,7 @@ def _start_writer(part: Path, picture: np.ndarray, fps: float) -> Generator[None
 
 
 def frames_of(film: Path) -> int:
-    """Return how many frames a film holds, without decoding them; 0 if it cannot be read."""
+    """Return the number of frames of a film without decoding them; 0 if the film cannot be read."""
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", str(film), *FRAMES]
     done = subprocess.run(command, capture_output=True, check=False)  # noqa: S603  ffmpeg of a package
     counts = re.findall(rb"frame=\s*(\d+)", done.stderr)
@@ -132,7 +132,7 @@ def frames_of(film: Path) -> int:
 
 
 def latent_decoder(policy: Path) -> Decode | None:
-    """Return what draws, from an event window, the picture that a policy's latents hold.
+    """Return a function from an event window to the picture that is decoded from a policy's latents.
 
     None for a lean policy, which has no decoder.
     """
@@ -165,11 +165,11 @@ def coloured(picture: np.ndarray) -> np.ndarray:
 
 
 def frame(panels: Sequence[tuple[str, np.ndarray]], caption: str) -> np.ndarray:
-    """Panels uint8 (H, W, 3) side by side under their names, above a caption; uint8 with even sizes."""
+    """Draw panels, uint8 (H, W, 3), side by side with their names above a caption; uint8, even sizes."""
     height, width = panels[0][1].shape[:2]
-    across = max(2, len(panels))  # the caption needs the room of two
+    across = max(2, len(panels))  # the caption needs the width of two
     sizes = (across * (width * ZOOM + GAP) + GAP, height * ZOOM + 2 * BAR)
-    size = (sizes[0] + sizes[0] % 2, sizes[1] + sizes[1] % 2)  # as the encoder asks
+    size = (sizes[0] + sizes[0] % 2, sizes[1] + sizes[1] % 2)  # the video encoder needs even sizes
     picture = Image.new("RGB", size, INK)
     draw = ImageDraw.Draw(picture)
     font = ImageFont.load_default(17)

@@ -1,1 +1,1 @@
-"""The public benchmark: its frozen protocol, the results of a policy, their check, and the leaderboard."""
+"""The public benchmark: frozen protocol, results of a policy, verification of results, and leaderboard."""

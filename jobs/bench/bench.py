@@ -1,8 +1,8 @@
 """Evaluate a policy by EventPolicy-C: failures under corruptions, relative to those of a frozen reference.
 
 Run: evade bench POLICY, such as bytestream_hold-s0, models/mine, policy.onnx or my_policy.py:policy
-Expect: ten minutes on two idle cores for part C. A stopped run continues. In the run folder, under
-`bench/`, one JSON and one CSV file of the policy, as docs/benchmark.md asks for them.
+Expect: ten minutes on two idle cores for part C. To resume a stopped run, run the command again. In the run
+folder, under `bench/`, one JSON and one CSV file of the policy for submission (docs/benchmark.md).
 """
 
 import dataclasses
@@ -31,15 +31,15 @@ from jobs.run.provenance import git_commit
 
 @dataclass(frozen=True, config=STRICT)
 class Settings:
-    """Which policy is evaluated, by which part of the benchmark, and what its result says of it.
+    """The policy to evaluate, the part of the benchmark, and details for the leaderboard.
 
     Attributes:
         policy: A policy folder, a name in models/pretrained, a baseline, FILE.onnx, FILE.py:FUNCTION or
             FOLDER:FUNCTION.
         part: "C" corrupts the sensor, "W" changes the world.
-        name: In the leaderboard; None: the policy's own.
-        source: How anyone gets the policy, such as a link.
-        met: Corruptions that a policy from elsewhere met in training; those of a policy folder are known.
+        name: Name in the leaderboard; None: the policy's own name.
+        source: Where others can get the policy, such as a link.
+        met: Corruptions in the training of a foreign policy; known already for a policy folder.
     """
 
     policy: Name
@@ -53,7 +53,7 @@ def run(config: Config, executor: Executor | None = None) -> dict[str, float]:
     """Evaluate the policy in all cells, print its scores, and write its result.
 
     Raises:
-        ConfigError: There is no such policy, or a corruption has another name.
+        ConfigError: The policy does not exist, or `bench.met` names an unknown corruption.
     """
     own, protocol, action = config.own, read_protocol(), config.evaluate.action
     policy, kind = find_benchmarked("bench.policy", own.policy, config)
@@ -65,7 +65,7 @@ def run(config: Config, executor: Executor | None = None) -> dict[str, float]:
     console.print(f"{protocol.title}, part {own.part}: {policy.name}", markup=False)
     cells = evaluate_cells(tasks, store, executor or default_executor(config.cluster, place), "Benchmark")
     reference = protocol.reference["failures"]
-    if any(name not in reference for name, severity in cells if severity):  # of a protocol that begins
+    if any(name not in reference for name, severity in cells if severity):  # new protocol without reference
         console.print(f"The reference has no failures yet; here: {failure_counts(cells)}", markup=False)
         return {}
     scores, text = score([cells], reference), csv_of(cells)
@@ -96,7 +96,7 @@ def run(config: Config, executor: Executor | None = None) -> dict[str, float]:
 
 
 def _check_met(own: Settings, protocol: Protocol) -> None:
-    """Raise ConfigError for a corruption that the protocol does not have."""
+    """Raise ConfigError if `bench.met` names a corruption that the protocol lacks."""
     names = list(protocol.parts[own.part])
     unknown = [name for name in own.met if name not in names]
     if unknown:

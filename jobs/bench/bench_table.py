@@ -1,8 +1,8 @@
 """Check all results of the benchmark in a folder, and write its leaderboard: a table and a heat map.
 
 Run: evade bench table FOLDER
-Expect: seconds; FOLDER/leaderboard.md and FOLDER/leaderboard.png. A result that does not agree with itself
-or with the protocol stops the command by its name.
+Expect: seconds; FOLDER/leaderboard.md and FOLDER/leaderboard_PART.png. The command stops and names the file
+if a result is inconsistent or does not follow the protocol.
 """
 
 from collections import defaultdict
@@ -34,13 +34,13 @@ WORDS = 2
 
 @dataclass(frozen=True, config=STRICT)
 class Settings:
-    """Which folder holds the results."""
+    """The folder with the results."""
 
     folder: Name
 
 
 class Entry(NamedTuple):
-    """One line of the leaderboard: the trainings of a policy."""
+    """One line of the leaderboard: all trainings of a policy."""
 
     results: tuple[Result, ...]
     scores: Scores
@@ -55,7 +55,7 @@ def run(config: Config) -> dict[str, float]:
     """Check the results, and write the leaderboard.
 
     Raises:
-        RefusedResultError: A result is refused, or there is none.
+        RefusedResultError: A result is invalid, or there is none.
     """
     folder, protocol = Path(config.own.folder), read_protocol()
     board = entries(folder, protocol)
@@ -71,7 +71,7 @@ def entries(folder: Path, protocol: Protocol) -> dict[str, list[Entry]]:
     """Return the entries of each part, best first.
 
     Raises:
-        RefusedResultError: A result is refused, two are of one training, or there is none.
+        RefusedResultError: A result is invalid or its file has a wrong name, or there is none.
     """
     found: dict[tuple[str, str], list[Submission]] = defaultdict(list)
     for path in sorted(folder.glob("*.json")):
@@ -102,7 +102,7 @@ def table(own: Sequence[Entry]) -> str:
 
 
 def _row(entry: Entry) -> tuple[str, ...]:
-    """Return the texts of an entry."""
+    """Return the texts of an entry's line."""
     scores, first = entry.scores, entry.results[0]
     low, high = scores.interval or (np.nan, np.nan)
     several = len(entry.results)
@@ -122,7 +122,7 @@ def _row(entry: Entry) -> tuple[str, ...]:
 
 
 def heat_map(own: Sequence[Entry], protocol: Protocol, part: str) -> Figure:
-    """Draw the share of failures of each entry in each cell; a dot marks what was met in training."""
+    """Draw the failure rate of each entry in each cell; a dot marks corruptions met in training."""
     corruptions = list(protocol.parts[part])
     rates = np.array(
         [[rate for name in corruptions for rate in entry.scores.failures[name]] for entry in own]

@@ -2,8 +2,8 @@
 
 Run: evade bench verify RESULT.json
 Expect: half a minute on two cores; the number of equal episodes, or the first that differs and exit status
-1. A changed episode is found with the probability of the share, so a result with many of them hardly
-passes.
+1. The probability of detecting one changed episode equals the repeated share, so a result with many changed
+episodes is unlikely to pass.
 """
 
 import dataclasses
@@ -35,12 +35,12 @@ Chosen = Sequence[tuple[Cell, int]]  # cell and corridor
 
 @dataclass(frozen=True, config=STRICT)
 class Settings:
-    """Which result is checked.
+    """The result to check.
 
     Attributes:
-        result: Its JSON file; the CSV file is beside it.
-        policy: Where the policy is here; None: its name in models/pretrained, or a baseline.
-        share: Of the episodes, which are repeated.
+        result: Its JSON file; the CSV file is in the same folder.
+        policy: Local path of the policy; None: its name in models/pretrained, or a baseline.
+        share: Share of the episodes to repeat, 0..1.
     """
 
     result: Name
@@ -52,8 +52,8 @@ def run(config: Config, executor: Executor | None = None) -> dict[str, float]:
     """Repeat a random part of a result's episodes.
 
     Raises:
-        RefusedResultError: The result does not agree with itself, or an episode does not repeat.
-        ConfigError: The policy is not here.
+        RefusedResultError: The result is inconsistent, or a repeated episode differs.
+        ConfigError: The policy is not on this machine.
     """
     protocol = read_protocol()
     submission = read_result(Path(config.own.result), protocol)
@@ -88,14 +88,14 @@ def total(submission: Submission) -> int:
 
 
 def choose(submission: Submission, share: float, rng: np.random.Generator) -> Chosen:
-    """Draw a share of the episodes, one at least."""
+    """Draw a random share of the episodes, at least one."""
     every = [(cell, int(seed)) for cell, rows in submission.episodes.items() for seed in rows["seed"]]
     places = rng.choice(len(every), math.ceil(share * len(every)), replace=False)
     return [every[place] for place in np.sort(places)]
 
 
 def some_of(tasks: Tasks, chosen: Chosen) -> Tasks:
-    """Return the tasks with the chosen corridors alone."""
+    """Restrict the tasks to the chosen corridors."""
     wanted = set(chosen)
     found: dict[Cell, list[EvaluationTask]] = {}
     for cell, group in tasks.items():
@@ -106,7 +106,7 @@ def some_of(tasks: Tasks, chosen: Chosen) -> Tasks:
 
 
 def check_equal(submission: Submission, repeated: dict[Cell, np.ndarray], protocol: Protocol) -> None:
-    """Raise RefusedResultError for the first episode that has another byte than its repetition."""
+    """Raise RefusedResultError for the first episode that is not byte-identical to its repetition."""
     for cell, rows in repeated.items():
         theirs = submission.episodes[cell][rows["seed"]]
         for here, there in zip(rows, theirs, strict=True):

@@ -29,10 +29,10 @@ Kind = Literal["folder", "onnx", "function", "baseline"]
 
 
 def find_benchmarked(key: str, name: str, config: Config) -> tuple[EvaluatedPolicy, Kind]:
-    """Return the policy of a name, and how it is run.
+    """Find a policy by name or path; return it with its kind.
 
     Raises:
-        ConfigError: There is none.
+        ConfigError: There is no such policy.
     """
     if name in BASELINES:
         return read_policy(name), "baseline"
@@ -44,10 +44,10 @@ def find_benchmarked(key: str, name: str, config: Config) -> tuple[EvaluatedPoli
 def evaluate_cells(
     tasks: Tasks, store: EpisodeStore, executor: Executor, title: str
 ) -> dict[Cell, np.ndarray]:
-    """Evaluate what the store lacks; return the EPISODE rows of each cell, by corridor.
+    """Evaluate the episodes that the store lacks; return the EPISODE rows of each cell, sorted by corridor.
 
     Raises:
-        RunError: Some could not be evaluated; the same command tries them again.
+        RunError: Tasks failed; running the same command again repeats them.
     """
     whole = joined(task for group in tasks.values() for task in group)
     _, failed = evaluate_tasks(whole, store, executor, title, measure_accuracy=False)
@@ -61,7 +61,7 @@ def evaluate_cells(
 
 
 def joined(tasks: Iterable[EvaluationTask]) -> list[EvaluationTask]:
-    """Return the tasks, those of one simulation as one: an agent that sees no fault has few of them."""
+    """Merge tasks with the same simulation; an agent that no fault affects has few different ones."""
     found: dict[str, EvaluationTask] = {}
     for task in tasks:
         seeds = sorted({*task.seeds, *(found[task.key].seeds if task.key in found else ())})
@@ -73,7 +73,7 @@ class Timed:
     """An agent whose decisions are timed.
 
     Attributes:
-        seconds: Of each decision.
+        seconds: Wall time of each decision [s].
     """
 
     def __init__(self, agent: Agent) -> None:
@@ -91,7 +91,7 @@ class Timed:
 
 
 def cost_of(policy: EvaluatedPolicy, action: str, env: EnvConfig) -> Cost:
-    """Measure what a policy costs in one training corridor of the clean cell, on one core."""
+    """Measure the cost of a policy in one training corridor of the clean cell, on one core."""
     with torch_threads(1):
         agent = Timed(make_agent(policy.agent, action))
         roll_out(agent, dataclasses.replace(env, split="train"), (0,))
@@ -105,14 +105,14 @@ def cost_of(policy: EvaluatedPolicy, action: str, env: EnvConfig) -> Cost:
 
 
 def _place(agent: str) -> Path:
-    """Return the file or folder of an agent: of a function, that of its imported module."""
+    """Return the file or folder of an agent; for a function, of its imported module."""
     module = sys.modules.get(agent.rpartition(":")[0])
     path = Path(agent if module is None or module.__file__ is None else module.__file__)
     return path.parent if path.name == "__init__.py" else path
 
 
 def _operations(agent: Timed) -> int | None:
-    """Return additions and comparisons for each event of a tabulated encoder; None if it is not known."""
+    """Return the additions and comparisons per event of a tabulated encoder; None if unknown."""
     inner: Any = agent._agent
     features = getattr(getattr(getattr(inner, "policy", None), "encoder", None), "features", None)
     return None if features is None else 2 * int(features.shape[1])

@@ -28,16 +28,16 @@ Cell = tuple[str, int]  # corruption and severity
 
 @dataclass(frozen=True)
 class Protocol:
-    """What the file of a protocol says.
+    """The content of a protocol's file.
 
     Attributes:
-        name, version: Of the benchmark.
-        sha256: Of the bytes of its file.
-        split: Whose corridors.
-        corridors: How many, from seed 0 on.
+        name, version: Name and version of the benchmark.
+        sha256: SHA-256 of the file.
+        split: Split of the corridors, such as "eval".
+        corridors: Number of corridors, with seeds from 0.
         env: The simulation of the clean cell.
-        reference: The policy whose failures are 100 %, and its failures: corruption -> number.
-        parts: Part -> corruption -> setting -> values of the five severities, or one for all.
+        reference: The policy whose failures count as 100 %, and its failures: corruption -> number.
+        parts: Part -> corruption -> setting -> values of the five severities, or one value for all.
     """
 
     name: str
@@ -55,7 +55,7 @@ class Protocol:
         return f"{self.name} v{self.version}"
 
     def cells(self, part: str) -> dict[Cell, dict[str, Any]]:
-        """Return the cells of a part with what each changes, the clean one first."""
+        """Return cell -> changed settings for all cells of a part, the clean cell first."""
         found: dict[Cell, dict[str, Any]] = {(CLEAN, 0): {}}
         for corruption, axis in self.parts[part].items():
             for severity, point in enumerate(axis_points(axis), 1):
@@ -64,7 +64,7 @@ class Protocol:
 
 
 def read_protocol(path: Path = PROTOCOL) -> Protocol:
-    """Return the protocol of a file."""
+    """Read a protocol from its YAML file."""
     text = path.read_bytes()
     values = yaml.safe_load(text)
     env = env_with(EnvConfig(split=values["split"]), values.pop("env"))
@@ -74,10 +74,10 @@ def read_protocol(path: Path = PROTOCOL) -> Protocol:
 def tasks_of(
     protocol: Protocol, part: str, policy: EvaluatedPolicy, action: str
 ) -> dict[Cell, list[EvaluationTask]]:
-    """Return the evaluation tasks of each cell; several where corridors take turns.
+    """Return the evaluation tasks of each cell; several if its corridors alternate between settings.
 
     Raises:
-        ConfigError: The policy needs another camera or vehicle than the protocol's.
+        ConfigError: The policy needs a different camera or vehicle than the protocol's.
     """
     base = with_own_parts(policy, protocol.env)
     if base.vehicle != protocol.env.vehicle:
@@ -100,7 +100,7 @@ def tasks_of(
 
 
 def changes_in_turn(changes: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the changes of each group of corridors; a value that is a list gives one to each group."""
+    """Return the changes for each group of corridors; a list as value has one entry per group."""
     turns = max((len(value) for value in changes.values() if isinstance(value, list)), default=1)
     return [
         {
@@ -112,9 +112,9 @@ def changes_in_turn(changes: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def met_in_training(protocol: Protocol, part: str, policy: EvaluatedPolicy) -> list[str]:
-    """Return the corruptions of which a policy's training drew a severity; none of a foreign policy.
+    """Return the corruptions whose severities a policy's training drew; empty for a foreign policy.
 
-    What is the same at all severities, as the scatter of a noise, does not tell them apart.
+    Settings that are the same at all severities, such as the scatter of a noise, are ignored.
     """
     base = with_own_parts(policy, protocol.env)
     return [name for name in protocol.parts[part] if _has_met(protocol, part, name, policy, base)]

@@ -1,8 +1,8 @@
-"""A result: one JSON file with scores and provenance, and one CSV file with every episode beside it.
+"""A result: a JSON file with scores and provenance, and a CSV file with every episode in the same folder.
 
-`read_result` accepts only what agrees with itself: the schema, the JSON's checksum, the protocol's SHA-256,
-the CSV's SHA-256, one episode for each corridor of each cell, and scores that follow from these episodes.
-Whoever changes a digit and all of these has still to fly: `evade bench verify` does.
+`read_result` accepts only consistent results. It checks the schema, the JSON's checksum, the protocol's
+SHA-256, the CSV's SHA-256, one episode for each corridor of each cell, and the scores against the episodes.
+A forgery that passes all of these is detected by repeating episodes: `evade bench verify`.
 """
 
 import csv
@@ -31,7 +31,7 @@ Text = Annotated[str, Field(min_length=1, max_length=200)]
 
 
 class Cost(pydantic.BaseModel, extra="forbid", strict=True):
-    """What a policy costs; measured where it was evaluated, and not repeated by a verification."""
+    """Cost of a policy, measured on the machine that evaluated it; a verification does not repeat it."""
 
     bytes: Annotated[int, Field(ge=0)] | None
     operations_per_event: Annotated[int, Field(ge=0)] | None
@@ -44,15 +44,15 @@ class Result(pydantic.BaseModel, extra="forbid", strict=True):
     Attributes:
         benchmark, protocol: Name with version, and SHA-256 of the protocol's file.
         part: "C" or "W".
-        policy, training: Group, and the seed of the training if there are several.
-        kind: How the policy is run.
-        identity: Hash of its manifest, its file or its module.
-        source: How anyone gets it, such as a link; empty: not given.
-        action: How a policy folder or an ONNX file chooses.
-        met: Corruptions of which its training met a severity.
-        mce, clean, worst, errors, failures: As `jobs.bench.score.Scores`.
+        policy, training: Group, and the training's seed if the group has several.
+        kind: "folder", "onnx", "function" or "baseline".
+        identity: Hash of the policy's manifest, file or module.
+        source: Where others can get the policy, such as a link; empty: not given.
+        action: How a policy folder or an ONNX file chooses its action.
+        met: Corruptions with a severity in the policy's training.
+        mce, clean, worst, errors, failures: As in `jobs.bench.score.Scores`.
         episodes: SHA-256 of the CSV file.
-        commit, processor: Where it was evaluated.
+        commit, processor: Code and machine of the evaluation.
     """
 
     benchmark: Text
@@ -77,7 +77,7 @@ class Result(pydantic.BaseModel, extra="forbid", strict=True):
 
     @property
     def name(self) -> str:
-        """Return the name of its files, without suffix."""
+        """Return the name of the result's files without suffix."""
         seed = "" if self.training is None else f"-s{self.training}"
         return f"{self.policy}{seed}-{self.part}"
 
@@ -91,11 +91,11 @@ class Submission:
 
 
 class RefusedResultError(RunError):
-    """A result that does not agree with itself or with the protocol."""
+    """A result that is inconsistent or does not follow the protocol."""
 
 
 def csv_of(episodes: Episodes) -> str:
-    """Return the text of the CSV file."""
+    """Return the episodes as the text of the CSV file."""
     text = io.StringIO()
     as_table(LABELS, episodes).to_csv(text, index=False, lineterminator="\n")
     return text.getvalue()
@@ -112,7 +112,7 @@ def read_result(path: Path, protocol: Protocol) -> Submission:
     """Read and check a result.
 
     Raises:
-        RefusedResultError: With the rule that it breaks.
+        RefusedResultError: The result is invalid; the message states the violated rule.
     """
     try:
         result = Result(**read_json(path))
@@ -138,7 +138,7 @@ def read_result(path: Path, protocol: Protocol) -> Submission:
 
 
 def _first_line(error: Exception) -> str:
-    """Return the first problem of an error in one line."""
+    """Return the first problem in an error as one line."""
     if isinstance(error, pydantic.ValidationError):
         problem = error.errors()[0]
         return f"{'.'.join(map(str, problem['loc']))}: {problem['msg']}"
@@ -151,7 +151,7 @@ def _require(path: Path, what: str, expected: object, found: object) -> None:
 
 
 def _episodes_of(table: Path, text: str, protocol: Protocol, part: str) -> dict[Cell, np.ndarray]:
-    """Return the episodes of a CSV file by cell; exactly one for each corridor of each cell."""
+    """Parse the episodes of a CSV file by cell; require exactly one for each corridor of each cell."""
     cells = protocol.cells(part)
     rows = list(csv.reader(io.StringIO(text)))
     _require(table, "columns", [*LABELS, *(EPISODE.names or ())], rows[0] if rows else [])
@@ -171,7 +171,7 @@ def _episodes_of(table: Path, text: str, protocol: Protocol, part: str) -> dict[
 
 
 def _values(row: list[str]) -> tuple[Any, ...]:
-    """Return the values of an episode as EPISODE has them; every number must be written as it was."""
+    """Parse the fields of an EPISODE; raise ValueError or KeyError if one is malformed or not finite."""
     kinds = [EPISODE[name].kind for name in EPISODE.names or ()]
     read: dict[str, Any] = {"b": {"True": True, "False": False}.__getitem__, "i": int, "f": float}
     values = tuple(read[kind](text) for text, kind in zip(row, kinds, strict=True))
@@ -181,7 +181,7 @@ def _values(row: list[str]) -> tuple[Any, ...]:
 
 
 def _check_scores(path: Path, result: Result, episodes: Episodes, protocol: Protocol) -> None:
-    """Check that the scores follow from the episodes."""
+    """Check that the scores match the episodes."""
     own: Mapping[str, Any] = score([episodes], protocol.reference["failures"])._asdict()
     for name in ("mce", "clean", "worst", "errors", "failures"):
         _require(path, name, own[name], getattr(result, name))

@@ -1,7 +1,7 @@
-"""Scores of a policy, as ImageNet-C: failures relative to those of a frozen reference in the same cells.
+"""Scores of a policy as in ImageNet-C: failures relative to a frozen reference policy in the same cells.
 
-The corruption error of a corruption is the policy's failures over its five severities, divided by the
-failures of the reference there: CE = 100 % is as bad as the reference, 0 % never fails. mCE is their mean
+The corruption error (CE) of a corruption is the policy's failures over its five severities, divided by the
+reference's failures: 100 % is as bad as the reference, 0 % never fails. mCE is the mean over corruptions
 (Hendrycks and Dietterich, ICLR 2019). A failure is an episode that does not reach the goal.
 """
 
@@ -14,20 +14,21 @@ import numpy as np
 from jobs.analysis.statistics import crossed_mean
 from jobs.bench.protocol import CLEAN, Cell
 
-Episodes = Mapping[Cell, np.ndarray]  # EPISODE of each cell, the same corridors in all
+Episodes = Mapping[Cell, np.ndarray]  # EPISODE (corridors,) of each cell, the same corridors in all
 
 
 class Scores(NamedTuple):
-    """What the leaderboard says of one or several trainings of a policy.
+    """Scores of one or several trainings of a policy, as shown in the leaderboard.
 
     Attributes:
         mce: Mean corruption error, 1 for the reference.
-        interval: Its 95 % interval over trainings and corridors; of one training over corridors alone.
-        errors: Corruption -> its corruption error.
-        clean: Share of clean episodes that fail.
-        worst: Greatest share of failures in a cell.
-        worst_cell: That cell.
-        failures: Corruption -> share of episodes that fail at each severity.
+        interval: 95 % interval of the mCE over trainings and corridors; over corridors only for a single
+            training.
+        errors: Corruption -> corruption error.
+        clean: Share of failures in the clean cell.
+        worst: Largest share of failures in any cell but the clean one.
+        worst_cell: The cell with the largest share of failures.
+        failures: Corruption -> share of failures at each severity.
     """
 
     mce: float
@@ -40,7 +41,7 @@ class Scores(NamedTuple):
 
 
 def failure_counts(episodes: Episodes) -> dict[str, int]:
-    """Return corruption -> failures over all of its severities; of the clean cell its own."""
+    """Return corruption -> number of failures over all severities, including the clean cell's."""
     found: dict[str, int] = {}
     for (corruption, _), rows in episodes.items():
         found[corruption] = found.get(corruption, 0) + int((~rows["success"]).sum())
@@ -48,10 +49,10 @@ def failure_counts(episodes: Episodes) -> dict[str, int]:
 
 
 def score(trainings: Sequence[Episodes], reference: Mapping[str, int]) -> Scores:
-    """Return the scores of a policy.
+    """Compute the scores of a policy.
 
     Args:
-        trainings: The episodes of each training, of one part of the protocol.
+        trainings: Episodes of each training in one part of the protocol.
         reference: Corruption -> failures of the reference over all severities.
 
     Raises:
@@ -65,7 +66,7 @@ def score(trainings: Sequence[Episodes], reference: Mapping[str, int]) -> Scores
     failed = {cell: np.stack([~by_cell[cell]["success"] for by_cell in trainings]) for cell in cells}
     rates = {cell: int(values.sum()) / values.size for cell, values in failed.items()}
     own = {name: sum(failed[cell].astype(float) for cell in cells if cell[0] == name) for name in corruptions}
-    # Sums and quotients that round the same way on every machine: a result is compared with its scores.
+    # Sums and quotients must round identically on every machine: `read_result` compares scores exactly.
     errors = {name: int(np.sum(own[name])) / (len(trainings) * reference[name]) for name in corruptions}
     shares = [np.shape(own[name])[1] * own[name] / reference[name] for name in corruptions]
     interval = crossed_mean(np.mean(shares, axis=0)).interval

@@ -1,8 +1,8 @@
-"""How a policy may be trained: a table of algorithms, and the settings of each.
+"""The table of training algorithms, and the settings of each.
 
-To add an algorithm of RLlib's, write `conf/algo/NAME.yaml` with `name: rllib`. To add one of your own, write
-a folder `jobs/training/NAME` with a `jobs.training.algorithms.Algorithm`, a row here, and its YAML file.
-A row names its algorithm as "module:attribute", so that a configuration is checked without importing Ray.
+To add an algorithm of RLlib, write `conf/algo/NAME.yaml` with `name: rllib`. To add your own, write a folder
+`jobs/training/NAME` with a `jobs.training.algorithms.Algorithm`, a row here, and its YAML file. A row names
+its algorithm as "module:attribute", so that a configuration is checked without importing Ray.
 """
 
 import dataclasses
@@ -26,11 +26,12 @@ class ImitationConfig:
 
     Attributes:
         temperature: Labels are softmax(-cost / temperature); costs as in `envs.scene.planning`.
-        guided_batches: In the first batches the teacher acts too: in all steps of the first, then in half as
-            many in each; 0: never.
+        guided_batches: Number of first batches in which the teacher also acts: in all steps of the first,
+            then in half as many with each further batch; 0: none.
         fit_steps: Gradient steps after each batch, on steps of all batches.
-        final_steps: Gradient steps after the last, from the first weights, with a step size that falls to 0.
-        keep_mb: Memory for the steps that are kept [MB]; beyond it, a random sample of all.
+        final_steps: Gradient steps after the last batch. They start from the initial weights, with a step
+            size that falls to 0.
+        keep_mb: Memory for stored steps [MB]; if it is full, a random sample of all steps is stored.
     """
 
     temperature: Positive
@@ -41,7 +42,7 @@ class ImitationConfig:
 
 
 def _imitation(values: object) -> object:
-    """Convert a mapping to the settings, because pydantic in strict mode takes no mapping for a dataclass."""
+    """Convert a mapping to the settings, because strict pydantic accepts no mapping for a dataclass."""
     return checked(ImitationConfig, dict(values)) if isinstance(values, Mapping) else values
 
 
@@ -50,15 +51,15 @@ class AlgoConfig:
     """PPO, each word as RLlib spells it (appendix D.1.2).
 
     Attributes:
-        critic: What the value network sees: what the policy does, or also what the cheapest way to the goal
-            line costs, of a teacher that knows the geometry.
-        shaping: Of the potential -shaping * log(1 + that cost), by which rewards are shaped in training only;
-            0: they are not.
-        imitation: Learn from a teacher instead; of the others then only lr, sizes, grad_clip, mirrored and
-            teacher_sight_m count.
-        mirrored: Learn each step a second time, left and right exchanged (`models.policy.mirror`).
-        teacher_sight_m: How far ahead the teacher plans [m], in imitation, critic and shaping alike; None: to
-            the goal line.
+        critic: Input of the value network: the policy's input (`observation`), or in addition the cost of the
+            cheapest path to the goal line, from a teacher that knows the geometry (`teacher`).
+        shaping: Factor of the potential -shaping * log(1 + that cost), which shapes the rewards in training
+            only; 0: no shaping.
+        imitation: Learn from a teacher instead; then only lr, sizes, grad_clip, mirrored and teacher_sight_m
+            of the other settings count.
+        mirrored: Learn each step a second time with left and right exchanged (`models.policy.mirror`).
+        teacher_sight_m: How far ahead the teacher plans [m], for imitation, critic and shaping; None: to the
+            goal line.
     """
 
     lr: Positive
@@ -96,22 +97,22 @@ class AlgoConfig:
 
     @property
     def name(self) -> str:
-        """Return the row of `ALGORITHMS`."""
+        """Return the algorithm's key in `ALGORITHMS`."""
         return "ppo" if self.imitation is None else "imitation"
 
 
 @dataclass(frozen=True, config=STRICT)
 class RLlibConfig:
-    """An algorithm of RLlib's, configured by its user.
+    """An algorithm of RLlib, configured by the user.
 
     Attributes:
-        name: "rllib", the row of `ALGORITHMS`.
+        name: "rllib", the key in `ALGORITHMS`.
         algorithm: RLlib's name, such as DQN, SAC, APPO or IMPALA.
-        settings: What `AlgorithmConfig.training` of that algorithm takes.
-        lr_schedule: Whether settings.lr stays, or falls to 0 at the last environment step.
-        reward_scale: Multiplies the rewards that it learns from.
-        num_env_runners: Processes that roll out episodes; 0: the learner's own process does.
-        num_envs_per_env_runner: Environments that each steps together.
+        settings: Arguments of `AlgorithmConfig.training` of that algorithm.
+        lr_schedule: "constant", or "linear": settings.lr falls to 0 at the last environment step.
+        reward_scale: Factor of the rewards that it learns from.
+        num_env_runners: Processes that roll out episodes; 0: the learner's process.
+        num_envs_per_env_runner: Environments that each process steps together.
     """
 
     imitation: ClassVar[None] = None
@@ -129,7 +130,7 @@ Algo = AlgoConfig | RLlibConfig
 
 
 class Row(NamedTuple):
-    """One algorithm.
+    """An algorithm.
 
     Attributes:
         settings: The dataclass of its settings.
@@ -148,7 +149,7 @@ ALGORITHMS = {
 
 
 def read_algo(**values: object) -> Algo:
-    """Return the settings of an algorithm, checked; without a `name` they are those of PPO.
+    """Check and return the settings of an algorithm, which is PPO if there is no `name`.
 
     Raises:
         pydantic.ValidationError: A setting is missing, unknown to this algorithm, or has a wrong value.
@@ -162,6 +163,6 @@ def read_algo(**values: object) -> Algo:
 
 
 def algo_keys() -> list[str]:
-    """Return the settings of all algorithms."""
+    """Return the names of the settings of all algorithms."""
     fields = (field for row in ALGORITHMS.values() for field in dataclasses.fields(row.settings))
     return list(dict.fromkeys(field.name for field in fields))

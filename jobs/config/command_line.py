@@ -1,4 +1,4 @@
-"""Translate a user's words into the words that Hydra composes: experiments, jobs, and names that changed."""
+"""Translate the words of a command line for Hydra: experiments, jobs, and names that have changed."""
 
 import re
 import shlex
@@ -10,7 +10,7 @@ from jobs.config.registry import CONF, JOBS
 
 RENAMED_JOBS = {"ship": "publish", "tune": "search"}  # old name -> new
 RENAMED_SECTIONS = {"tune": "search", "video": "video_events"}
-TAKE_A_WORD = (  # Hydra's options
+TAKE_A_WORD = (  # options of Hydra whose value is the next word
     *("--cfg", "-c", "--package", "-p", "--info", "-i"),
     *("--config-path", "-cp", "--config-name", "-cn", "--config-dir", "-cd"),
 )
@@ -21,9 +21,9 @@ def hydra_words(words: Sequence[str]) -> list[str]:
     """Return the words for Hydra.
 
     A first word NAME stands for +exp=NAME. `+exp=NAME` is the file conf/exp/NAME.yaml or, without one, the
-    job of that name; NAME VERB is the job NAME_VERB. Behind the name of a job, words without = are its own
+    job of that name; NAME VERB is the job NAME_VERB. After the name of a job, words without = are its own
     settings in the order of its file: `evade demo bytestream-s1` is `evade demo demo.policy=bytestream-s1`.
-    Old names of jobs and of their settings stand for the new ones.
+    Old names of jobs and of their settings are replaced by the new ones.
     """
     words = list(words)
     if len(words) > 1 and f"{words[0]}_{words[1]}" in JOBS:
@@ -36,7 +36,7 @@ def hydra_words(words: Sequence[str]) -> list[str]:
 
 
 def _placed(words: Sequence[str], name: str) -> list[str]:
-    """Return the words with each that stands alone as the next of the job's own settings."""
+    """Return the words; each word without = becomes the next of the job's own settings."""
     keys = iter(JOBS[name].own_keys() if name in JOBS else ())
     placed = []
     for before, word in zip(["", *words], words, strict=False):
@@ -47,7 +47,7 @@ def _placed(words: Sequence[str], name: str) -> list[str]:
 
 
 def _quoted(word: str) -> str:
-    """Return a word as a value in Hydra's grammar, in which a backslash escapes before a quote alone."""
+    """Quote a word as a value in Hydra's grammar, in which a backslash escapes only before a quote."""
     if re.fullmatch(r"[\w./:@-]+", word):
         return word
     inner = re.sub(r"(\\*)('|$)", lambda found: found[1] * 2 + ("\\'" if found[2] else ""), word)
@@ -70,7 +70,7 @@ def given_keys(words: Sequence[str]) -> set[str]:
 
 
 def _experiment(file: Path) -> set[str]:
-    """Return {"exp"} for the experiment of a policy; a stage or a study takes the experiment of the run."""
+    """Return {"exp"} for the experiment of a policy; stages and studies use the experiment of the run."""
     policy = (
         file.is_file() and f"\nexp: {file.stem}\n" in file.read_text() and "/job:" not in file.read_text()
     )
@@ -108,7 +108,7 @@ def experiments() -> list[str]:
 
 
 def _job(word: str) -> str:
-    """Return `job=NAME` if the word names a job, under its present name; otherwise return the word."""
+    """Return `job=NAME` with the job's current name if the word names a job; otherwise return the word."""
     named = EXPERIMENT.fullmatch(word) or re.fullmatch(r"job=(\w+)", word)
     if not named:
         return word
@@ -118,7 +118,7 @@ def _job(word: str) -> str:
 
 
 def _section(word: str) -> str:
-    """Return the word with the present name of its section."""
+    """Return the word with the current name of its section."""
     key = re.match(r"([+~]*)(\w+)(?=[.=]|$)", word)
     if not key or key[2] not in RENAMED_SECTIONS:
         return word

@@ -1,9 +1,9 @@
 """Axes and conditions: settings of the simulation that change together.
 
-A study takes the points of an axis one by one. A training or a data set draws a condition for each episode:
-one of a list, by their `weight` (1 unless it is given), and in it each value: a number or a word as it
-stands, one of a list, or one of a range {low: 50, high: 500}, even in its logarithm with `log: true`; between
-whole numbers it is a whole number.
+A study evaluates the points of an axis one by one. A training or a data set draws for each episode one of a
+list of conditions, by their `weight` (default 1), and then each value of the condition. A number or a word is
+used unchanged. A list gives one of its values. A range {low: 50, high: 500} gives a uniform number, whose
+logarithm is uniform with `log: true`; if both ends are whole numbers, so is the number.
 """
 
 import math
@@ -21,7 +21,7 @@ from jobs.config.errors import nearest
 from jobs.config.scenes import scene_errors
 
 CONDITION_KEYS = [key for key in ENV_KEYS if f"{key}." not in OPEN_KEYS]
-# The policy's network is built for them, or its window, or its actions.
+# The policy's network, its window or its actions are built for them.
 NETWORK_KEYS = (
     *("camera.width", "camera.height", "env.window_capacity", "env.filter_support", "env.filter_tau_us"),
     *("env.vehicle", "env.body.command", "env.body.primitives"),
@@ -30,7 +30,7 @@ WEIGHT = "weight"
 
 
 def _number_or_word(value: object) -> float | str | None:
-    """Return a number, a word or null. A union of types would give several messages instead of one."""
+    """Check and return a number, a word or null; a union of types would give several messages."""
     if value is None or isinstance(value, str):
         return value
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
@@ -39,7 +39,7 @@ def _number_or_word(value: object) -> float | str | None:
 
 
 def _settings(value: object) -> Any:
-    """Return a setting, a list from which one is drawn, or a range."""
+    """Check and return a value, a list of values to draw from, or a range."""
     if isinstance(value, Mapping):
         low, high, log = value.get("low"), value.get("high"), value.get("log", False)
         known = value.keys() <= {"low", "high", "log"} and isinstance(log, bool)
@@ -56,7 +56,7 @@ def _settings(value: object) -> Any:
 
 
 def _searched(value: object) -> Any:
-    """Return a list of values, or a range."""
+    """Check and return a list of values, or a range."""
     if isinstance(value, list) and value:
         return value
     if not isinstance(value, Mapping):
@@ -65,7 +65,7 @@ def _searched(value: object) -> Any:
 
 
 Setting = Annotated[float | str | None, PlainValidator(_number_or_word)]
-NOMINAL = "nominal"  # the axis of the one condition that changes nothing
+NOMINAL = "nominal"  # the axis of the condition that changes nothing
 AxisName = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")]
 Values = Annotated[list[Setting], Field(min_length=1)]
 Axis = Annotated[dict[str, Values], Field(min_length=1)]
@@ -76,7 +76,7 @@ Conditions = Annotated[list[dict[str, Drawn]], Field(min_length=1)]
 
 
 def axis_points(axis: Mapping[str, Sequence[Setting]]) -> list[Condition]:
-    """Return the points of an axis, each as setting -> value: one value of a setting is for all points.
+    """Return the points of an axis, each as setting -> value; a single value applies to all points.
 
     Raises:
         ValueError: If the lengths differ, or two points have the same first value.

@@ -37,7 +37,7 @@ from models.kinds import KINDS, Model, PolicySpec, model_keys, read_model
 __all__ = ["HELD_OUT_SCENE", "Config", "ConfigError", "as_dict", "known_keys", "parse"]
 
 HELD_OUT_SCENE = "poles_eval"  # never trained on: wider, and laid out at random
-TRAINED_SCENE = "poles"  # which it is held out of
+TRAINED_SCENE = "poles"  # scene of trainings, from which it is held out
 
 Part = TypeVar("Part")
 
@@ -50,11 +50,11 @@ def _job(name: str) -> str:
 
 @dataclass(frozen=True, config=STRICT)
 class Config:
-    """One experiment, checked: what every job shares, and the settings of its own job.
+    """A checked experiment: the settings that all jobs share, and those of its own job.
 
     Attributes:
         env: The simulation, with camera, faults, fidelity and renderer.
-        own: The settings of the job alone, a `Settings` of the job's module; None if it has none.
+        own: The job's own settings, a `Settings` of its module; None if it has none.
     """
 
     job: Annotated[str, AfterValidator(_job)]
@@ -132,7 +132,7 @@ def as_dict(config: Config) -> dict[str, object]:
 
 
 def known_keys() -> list[str]:
-    """Return every key that all configurations have, whatever the job."""
+    """Return the keys that the configurations of all jobs share."""
     core = [name for name in fields_of(Config) if name != "own"]
     keys = [*core, "name", *ENV_GROUPS, *ENV_KEYS]
     for name, section in SECTIONS.items():
@@ -179,7 +179,7 @@ def _env(values: Mapping[str, object], errors: list[str]) -> EnvConfig | None:
 
 
 def _vehicle_errors(config: Config) -> list[str]:
-    """Return one line if the vehicle cannot be made, or has no discrete actions."""
+    """Return a line if the vehicle is invalid, has no discrete actions, or forbids algo.teacher_sight_m."""
     env = config.env
     if env.vehicle == "kinematic" and not env.body:
         return []
@@ -203,11 +203,11 @@ def _section(
     """Build a section from its values; return None if they are wrong, and add the reasons to `errors`.
 
     Args:
-        section: What takes the values.
+        section: Class or function that is called with the values.
         values: A mapping.
-        name: Of the section, "" for the whole configuration.
+        name: Name of the section, "" for the whole configuration.
         errors: Gets a line for each wrong value.
-        skip: Fields about which no error is reported.
+        skip: Fields whose errors are not reported.
     """
     if not isinstance(values, Mapping):
         errors.append(f"{name}: must be a group of settings, got {values!r}")
@@ -242,7 +242,7 @@ def unknown_key(key: str) -> str:
 
 
 def _named_scenes(config: Config) -> Iterator[tuple[str, str]]:
-    """Yield each scene that the configuration names, behind its key."""
+    """Yield the key and the name of each scene in the configuration."""
     yield "env.scene", config.env.scene
     yield "evaluate", HELD_OUT_SCENE
     yield from (("collect.scenes", name) for name in config.collect.scenes)
@@ -263,7 +263,7 @@ def _named_scenes(config: Config) -> Iterator[tuple[str, str]]:
 
 
 def _size_errors(config: Config) -> Iterator[str]:
-    """Yield one line for each list that is empty where something is needed."""
+    """Yield one line if neither scenes nor recordings are given to `collect`."""
     if not config.collect.scenes and not config.collect.recordings:
         yield "collect.scenes: must name a scene where collect.recordings is empty, got []"
 

@@ -1,7 +1,7 @@
 """Translate between `EnvConfig` and the keys of a user: env.*, camera.*, faults.*, fidelity.*, renderer.
 
-`EnvConfig` holds camera, faults, fidelity and renderer as fields of its own. On the command line,
-in conf/ and in the files of a run they are groups of their own. Only this file knows both shapes.
+`EnvConfig` has the fields camera, faults, fidelity and renderer. On the command line, in conf/ and
+in the files of a run they are separate groups. Only this file knows both forms.
 """
 
 import dataclasses
@@ -38,15 +38,15 @@ def key_of(section: str, path: Sequence[int | str]) -> str:
     return ".".join([*([section] if section and not beside else []), *map(str, path)])
 
 
-LAYOUT = "env.layout."  # begins the key of a layout's field, such as env.layout.ground_texture.pattern
-BODY = "env.body."  # begins the key of a vehicle's, such as env.body.tau_s
-ADDED_FAULT = "faults.added."  # begins the key of a plug-in's fault
+LAYOUT = "env.layout."  # prefix of the keys of a layout, such as env.layout.ground_texture.pattern
+BODY = "env.body."  # prefix of the keys of a vehicle, such as env.body.tau_s
+ADDED_FAULT = "faults.added."  # prefix of the keys of plug-in faults
 OPEN_FIELDS = {LAYOUT: ("layout",), BODY: ("body",), ADDED_FAULT: ("faults", "added")}  # as in `ENV_KEYS`
 OPEN_KEYS = tuple(OPEN_FIELDS)
 
 
 def env_with(env: EnvConfig, changes: Mapping[str, object]) -> EnvConfig:
-    """Return the simulation with settings replaced together, such as {"camera.memory": "frame"}.
+    """Return the simulation's settings with some replaced together, such as {"camera.memory": "frame"}.
 
     Raises:
         pydantic.ValidationError: If a setting is unknown or its value is not valid.
@@ -55,7 +55,7 @@ def env_with(env: EnvConfig, changes: Mapping[str, object]) -> EnvConfig:
     for key, value in changes.items():
         start = next((one for one in OPEN_KEYS if key.startswith(one)), None)
         if start is None:
-            values[ENV_KEYS.get(key, (key,))] = value  # an unknown key is for pydantic to reject
+            values[ENV_KEYS.get(key, (key,))] = value  # pydantic rejects an unknown key
             continue
         path = OPEN_FIELDS[start]
         whole = values.get(path, functools.reduce(getattr, path, env))

@@ -1,4 +1,4 @@
-"""Write configuration errors: the nearest key to an unknown one, and no password."""
+"""Format configuration errors: suggest the nearest key, and hide passwords."""
 
 import difflib
 import re
@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 SET_BY_JOBS = ("observation", "split")  # of `env`: training must never see the corridors of evaluation
 HIDDEN = "***"
-# Up to the last @: SQLAlchemy takes a password with a slash in it as it stands.
+# Up to the last @: SQLAlchemy accepts an unescaped slash in a password.
 USER_AND_PASSWORD = re.compile(r"""(?<=://)(?:[^\s/'"@:]*:[^\s'"]*|[^\s/'"]+)@""")
 SECRET_PARAMETER = re.compile(
     r"""([?&][^\s=&]*(?:pass|secret|token|api_?key)[^\s=&]*=)[^\s&'"]+""", re.IGNORECASE

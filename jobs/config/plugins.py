@@ -1,8 +1,8 @@
 """Plug-ins: Python files outside this repository that add scenes, faults and kinds of policy.
 
 A plug-in is a file, the folder of a package, or an installed module. Importing it adds rows to `LAYOUTS`,
-`SHAPES`, `ADDED_FAULTS`, `VEHICLES`, `TASKS` and `KINDS`, in which every job looks names up. The key
-`plugins` names them; Ray ships their code to each worker, which imports them before it does anything else
+`SHAPES`, `ADDED_FAULTS`, `VEHICLES`, `TASKS` and `KINDS`, in which every job looks up names. The key
+`plugins` lists the plug-ins. Ray ships their code to each worker, which imports them before anything else
 (docs/extend.md).
 """
 
@@ -26,8 +26,8 @@ from envs.scene.shapes import SHAPES
 from jobs.config.errors import ConfigError
 from models.kinds import KINDS, PolicySpec, TrialError
 
-GROUP = "evade.plugins"  # of the entry points of installed packages
-VARIABLE = "EVADE_PLUGINS"  # of a Ray worker: the names of its plug-ins
+GROUP = "evade.plugins"  # group of entry points of installed packages
+VARIABLE = "EVADE_PLUGINS"  # environment variable of a Ray worker: the names of its plug-ins
 ROWS: dict[str, dict[str, Any]] = {
     **{"scene": LAYOUTS, "shape": SHAPES, "fault": ADDED_FAULTS, "kind of policy": KINDS},
     **{"vehicle": VEHICLES, "task": TASKS},
@@ -44,9 +44,9 @@ def load_plugins(names: object) -> None:
             or a module that Python finds.
 
     Raises:
-        ConfigError: One cannot be imported, takes a name that is taken, or adds what cannot be used.
+        ConfigError: A plug-in cannot be imported, reuses a name, or adds something that cannot be used.
     """
-    for name in names if isinstance(names, list) else ():  # anything else is refused with its key
+    for name in names if isinstance(names, list) else ():  # another type is rejected later, with its key
         before, known = {what: dict(rows) for what, rows in ROWS.items()}, set(_loaded)
         try:
             _load(str(name), before)
@@ -65,7 +65,7 @@ def _load(name: str, before: Mapping[str, Mapping[str, Any]]) -> None:
     """Import a plug-in, unless it is loaded already, and check the rows that are new since `before`."""
     path = Path(name).resolve() if name.endswith(".py") or os.sep in name else None
     stem = path.stem if path else _module_of(name)
-    shipped = stem in os.environ.get(VARIABLE, "").split(",")  # a worker has it in another place
+    shipped = stem in os.environ.get(VARIABLE, "").split(",")  # workers import it from another place
     if stem in _loaded and (path is None or shipped or path in _files(_loaded[stem])):
         return
     if path is None:
@@ -88,7 +88,7 @@ def _module_of(name: str) -> str:
     """Return the module of the installed entry point of this name, or else the name itself.
 
     Raises:
-        ValueError: It leads to no one module, or there is neither an entry point nor a module of the name.
+        ValueError: The entry points do not name exactly one module, or nothing has this name.
     """
     points = importlib.metadata.entry_points(group=GROUP)
     modules = {point.value for point in points if point.name == name} or {name}
@@ -104,7 +104,7 @@ def _import_module(name: str) -> None:
     """Import a module that Python finds. Register it before it runs, so that errors name its line.
 
     Raises:
-        ValueError: It has no file, as a folder without __init__.py: nothing could be shipped or digested.
+        ValueError: It has no file (a folder without __init__.py), so it cannot be shipped or hashed.
     """
     if spec := importlib.util.find_spec(name):
         _loaded[name] = importlib.util.module_from_spec(spec)
@@ -154,7 +154,7 @@ def kind_errors(spec: PolicySpec) -> Iterator[str]:
     """Yield what is wrong with the feature or the network of a plug-in's kind, tried on a few events.
 
     Args:
-        spec: The policy; nothing is tried of a kind that no plug-in added, nor of one with an encoder.
+        spec: The policy; skipped if no plug-in added its kind, or if it has an encoder.
     """
     kind, name = KINDS[spec.model.name], spec.model.name
     owners = {part.partition(":")[0].partition(".")[0] for part in (kind.feature, kind.network)}
@@ -171,7 +171,7 @@ def kind_errors(spec: PolicySpec) -> Iterator[str]:
 
 
 def changed_plugins(digests: Mapping[str, str]) -> list[str]:
-    """Return the names of the loaded plug-ins whose content is another than in `digests`, name -> SHA-256."""
+    """Return the names of the loaded plug-ins whose content differs from `digests` (name -> SHA-256)."""
     now = plugin_digests() if digests else {}
     return [name for name, digest in digests.items() if now.get(name, digest) != digest]
 
@@ -196,7 +196,7 @@ def load_in_worker() -> None:
 
 
 def _load_shipped() -> Iterator[ConfigError]:
-    """Import the plug-ins of a Ray worker that it has not imported yet; yield why one cannot be."""
+    """Import the plug-ins that a Ray worker has not imported yet; yield an error for each that fails."""
     for name in os.environ.get(VARIABLE, "").split(","):
         if name and name not in _loaded:
             try:
@@ -206,7 +206,7 @@ def _load_shipped() -> Iterator[ConfigError]:
 
 
 def plugin_digests() -> dict[str, str]:
-    """Return the name and the content, a SHA-256, of each plug-in.
+    """Return name -> 12 digits of the SHA-256 of the content, for each plug-in.
 
     Raises:
         ConfigError: In a Ray worker, if one could not be imported.
@@ -217,13 +217,13 @@ def plugin_digests() -> dict[str, str]:
 
 
 def one_line(error: BaseException) -> str:
-    """Return type and text of an error, and the plug-in whose code raised it, if one did."""
+    """Return type and text of an error, and the plug-in whose code raised it, if any."""
     said = " ".join(f"{type(error).__name__}: {error}".split())
     return with_culprit(said, "".join(traceback.format_exception(error)))
 
 
 def with_culprit(said: str, trace: str) -> str:
-    """Return the text of an error with the plug-in that its traceback passes through, here or in a worker."""
+    """Add to the text of an error the plug-in that its traceback passes through, here or in a worker."""
     for name, module in _loaded.items():
         place = _place(module)
         shipped = rf"[^\"]*/py_modules_files/[^\"/]+/{re.escape(place.name)}"
@@ -252,7 +252,7 @@ def _digest(module: ModuleType) -> str:
 
 
 def digest_of(files: Iterable[Path], root: Path) -> str:
-    """Return 12 digits of a SHA-256 of files, of their names in the folder `root` and their content."""
+    """Return 12 digits of the SHA-256 of files: of their paths relative to `root` and their content."""
     digest = hashlib.sha256()
     for file in files:
         if file.is_file():

@@ -1,6 +1,6 @@
 """The jobs that `job=NAME` can run.
 
-A job is two files. `conf/job/NAME.yaml` names it and holds the values of its settings. The module NAME of a
+A job is two files. `conf/job/NAME.yaml` names it and has the values of its settings. The module NAME of a
 room of jobs/ (or of research/) has `run(config)` and, if the job has settings of its own, their class
 `Settings`. Nothing else lists jobs: help, dashboard and the tables of keys are derived from these two files.
 """
@@ -11,15 +11,15 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 ROOT = Path(__file__).resolve().parents[2]
-HOME = ROOT if (ROOT / "conf").is_dir() else Path(sys.prefix) / "share" / "evade"  # of an installed wheel
+HOME = ROOT if (ROOT / "conf").is_dir() else Path(sys.prefix) / "share" / "evade"  # in an installed wheel
 CONF = HOME / "conf"
 
 
 class Job(NamedTuple):
-    """One job.
+    """A job.
 
     Attributes:
-        module: Its `run(config)` does the job.
+        module: Module whose `run(config)` does the job.
         file: Its file in conf/job.
     """
 
@@ -34,8 +34,8 @@ class Job(NamedTuple):
             return text.readline().strip().strip('"').rstrip(".")
 
     def values(self) -> dict[str, Any]:
-        """Return what its file says; empty without one."""
-        import yaml  # a Python without the packages of Evade still says so
+        """Return the content of its file; empty without a file."""
+        import yaml  # imported late: the launcher reports missing packages
 
         return dict(yaml.safe_load(self.file.read_text(encoding="utf-8"))) if self.file else {}
 
@@ -52,7 +52,7 @@ class Job(NamedTuple):
 def module_of(name: str) -> str | None:
     """Return the module of a job: jobs.NAME, jobs.ROOM.NAME or jobs.ROOM.NAME.NAME, or the same in research.
 
-    None without one: an installation may leave research/ out.
+    Return None if there is none: an installation may lack research/.
 
     Raises:
         LookupError: If there is more than one.

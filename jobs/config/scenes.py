@@ -1,4 +1,4 @@
-"""Check that the scenes of a configuration can be made."""
+"""Check that the scenes of a configuration can be created."""
 
 from collections.abc import Sequence
 
@@ -9,14 +9,14 @@ from envs.scene.layouts import LAYOUTS
 
 
 def scene_errors(named: Sequence[tuple[str, str]], env: EnvConfig) -> list[str]:
-    """Return one line for each scene that cannot be made: its name, its file or the values of env.layout.
+    """Return one line for each scene that cannot be created: wrong name, file or values of env.layout.
 
-    A layout of `envs.scene.LAYOUTS` as it stands is known to be passable for the default vehicle
-    (tests/jobs/config/test_scenes.py), so only changed ones and mesh files are drawn.
+    The unchanged layouts of `envs.scene.LAYOUTS` are known to be passable for the default vehicle, so only
+    changed layouts and mesh files are drawn.
 
     Args:
         named: Pairs of the key that names a scene, and the scene; env.layout applies to each.
-        env: Gives env.layout, and the vehicle that has to get through.
+        env: Gives env.layout and the vehicle for which the scene must be passable.
     """
     vehicle = env.vehicle_radius_m, env.camera_height_m
     default = vehicle == (EnvConfig.vehicle_radius_m, EnvConfig.camera_height_m) and not env.layout

@@ -1,7 +1,7 @@
 """The settings that all jobs share, by section: names, types, ranges. Their values and units are in conf/.
 
-A field that is added to a section of a training (`jobs.run.identity.TRAINED_BY`) needs a default that does
-what was done before: older run folders lack the field. The settings of one job alone are the class `Settings`
+A field added to a section in `jobs.run.identity.TRAINED_BY` needs a default that reproduces the old
+behaviour, because older run folders lack the field. The settings of a single job are in the class `Settings`
 of its module.
 """
 
@@ -23,19 +23,19 @@ Pixels = Annotated[int, Field(ge=1, le=65536)]
 
 @dataclass(frozen=True, config=STRICT)
 class RecordingConfig:
-    """How a command reads event files: what the file itself does not say (docs/recordings.md).
+    """Settings for reading event files, for what the file itself does not say (docs/recordings.md).
 
     Attributes:
-        format: One of `envs.recordings.FORMATS`; None: by the file.
-        columns: Text: names of its columns in their order; npz and HDF5: names of t, x, y and p.
-        time_unit: Of the times; None: as the file says.
+        format: One of `envs.recordings.FORMATS`; None: recognized from the file.
+        columns: Text files: names of the columns in their order; npz and HDF5: names of t, x, y and p.
+        time_unit: Unit of the times; None: as the file says.
         width, height: Pixels of the sensor; None: as the file says.
         topic: Topic of a ROS bag.
         group: Group or data set of an HDF5 file, array of an npz file.
         stream: Number of a stream of an AEDAT file.
-        start_us, end_us: First time, and the time before which reading ends [us]; None: all.
-        max_events: Most events that are read at once; None: as `envs.recordings.read_events`.
-        strict: Whether a damaged file is refused; else what is damaged is left out and told.
+        start_us, end_us: Read events from the first time and before the second [us]; None: all.
+        max_events: Most events to read at once; None: the default of `envs.recordings.read_events`.
+        strict: Whether a damaged file is an error; otherwise damaged parts are skipped with a warning.
     """
 
     format: Name | None = None
@@ -54,14 +54,14 @@ class RecordingConfig:
 
 @dataclass(frozen=True, config=STRICT)
 class CollectConfig:
-    """The data set of the event VAE; scenes and recordings get equal shares of the steps.
+    """The data set of the event VAE; each scene and recording gets an equal share of the steps.
 
     Attributes:
         scenes: Layouts in which episodes are recorded.
-        recordings: Event files of real cameras; a short one contributes all that it has.
+        recordings: Event files of real cameras; a short file contributes all its events.
         policy: Run or policy folder of a policy to record in addition to random actions.
-        policy_share: Share of the control steps that the policy takes.
-        conditions: As those of `TrainConfig`, of the episodes that are recorded.
+        policy_share: Share of the control steps in which the policy acts.
+        conditions: Conditions of the recorded episodes, as in `TrainConfig`.
     """
 
     scenes: list[Name]
@@ -78,7 +78,7 @@ class PretrainConfig:
     """Training of the event VAE (appendix B.2).
 
     Attributes:
-        denoise: Whether it decodes the events as they were before the faults of the sensor.
+        denoise: Whether the decoder reconstructs the events as they were before the faults of the sensor.
     """
 
     encoder: str | None
@@ -100,11 +100,12 @@ class TrainConfig:
     """Training of the policy: length, checkpoints, initial policy and conditions.
 
     Attributes:
-        init: Run or policy folder whose policy is trained on; None: random weights.
-        value_warmup: Environment steps in which, after `init`, only the value network learns.
-        conditions: Settings of the simulation that are replaced together, as a sweep replaces
-            them; each episode draws one (`jobs.config.conditions`). [{}] changes nothing.
-        candidates: How many seeds are trained; the policy is the best of them under drawn faults.
+        init: Run or policy folder whose policy the training starts from; None: random weights.
+        value_warmup: First environment steps of a training with `init`, in which only the value network
+            learns.
+        conditions: Settings of the simulation that are replaced together, as in a study; each episode
+            draws one condition (`jobs.config.conditions`). [{}] changes nothing.
+        candidates: Number of seeds to train; the policy is the best of them under drawn faults.
     """
 
     env_steps: Count
@@ -136,12 +137,12 @@ class ClusterConfig:
     """Where Ray runs, and where its nodes store checkpoints and artifacts.
 
     Attributes:
-        address: Of a running cluster; None to start Ray on this machine.
-        num_cpus: How many cores jobs may use; None for all.
+        address: Address of a running cluster; None to start Ray on this machine.
+        num_cpus: Number of cores that jobs may use; None for all.
         storage: A folder that every node sees (NFS), or an address such as s3://bucket/evade;
-            None for the run folder, where there is only one machine.
-        device: Where event VAEs learn, and where PPO computes the gradients of networks over pictures or sets
-            of events; cuda: on this machine's GPU. Digits differ between the two by rounding.
+            None for the run folder, if there is only one machine.
+        device: Device on which event VAEs learn, and on which PPO computes the gradients of networks over
+            pictures or sets of events; cuda: this machine's GPU. Results of the two differ by rounding.
     """
 
     name: Literal["local", "ray"]
@@ -168,7 +169,7 @@ class ClusterConfig:
 
 @dataclass(frozen=True, config=STRICT)
 class TrackingConfig:
-    """Where results are recorded: the address of the MLflow store, and the experiment's name there."""
+    """The address of the MLflow store that records results, and the experiment's name there."""
 
     uri: Name
     experiment: Name

@@ -1,1 +1,1 @@
-"""Testing policies: held-out corridors, and sweeps over conditions."""
+"""Evaluation of policies in held-out corridors, and a demonstration of one episode."""

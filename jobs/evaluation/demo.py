@@ -1,8 +1,8 @@
 """Show a policy in one held-out corridor: its result as a line of numbers, and a film.
 
 Run: make demo, or python -m platform.launch +exp=demo demo.policy=bytestream-s1 env.scene=gates seed=3
-Expect: half a minute. The film lies in the run folder under `demo/`, with up to 100 frames for a second of
-flight, and opens where there is a display. Nothing is trained, and Ray and MLflow are not started.
+Expect: half a minute. The film is in the run folder under `demo/`, with up to 100 frames per second of
+flight, and opens if there is a display. Nothing is trained, and Ray and MLflow are not started.
 """
 
 import dataclasses
@@ -39,17 +39,17 @@ HEADINGS = (
 
 @dataclass(frozen=True, config=STRICT)
 class Settings:
-    """Whose episode is shown: a name in models/pretrained, "newest", or a path."""
+    """The policy to demonstrate: a name in models/pretrained, "newest", or a path."""
 
     policy: Name
 
 
 def find_shown(config: Config) -> tuple[EvaluatedPolicy, EnvConfig, PolicyAgent]:
-    """Find the policy and the environment that `config` asks for.
+    """Find the policy and the environment that `config` names.
 
     Returns:
         The policy; the held-out corridors, with the filter and the vehicle of its training; and its agent,
-        which acts by its likeliest or its drawn actions, as `evaluate.action` says.
+        which takes the likeliest or drawn actions, as `evaluate.action` says.
 
     Raises:
         ConfigError: There is no such policy.
@@ -63,9 +63,9 @@ def find_shown(config: Config) -> tuple[EvaluatedPolicy, EnvConfig, PolicyAgent]
 
 
 def at_own_pace(policy: EvaluatedPolicy, env: EnvConfig) -> EnvConfig:
-    """Return the simulation at the speed and rate of a policy's training, where none is asked for.
+    """Return the simulation with speed and control rate of a policy's training instead of the defaults.
 
-    None is asked for where they are the defaults. There is time for as long a way as before.
+    A configured speed or rate stays. The time limit changes with the speed, to allow the same distance.
     """
     usual = {name: getattr(env, name) == getattr(EnvConfig, name) for name in ("speed_mps", "control_hz")}
     own = {name: policy.sensor[name] for name, is_default in usual.items() if is_default}
@@ -80,7 +80,7 @@ def run(config: Config) -> np.void:
     """Record one episode of `demo.policy`, print its line and write its film; return the EPISODE ().
 
     Raises:
-        ConfigError: If there is no such policy.
+        ConfigError: There is no such policy.
     """
     policy, env, agent = find_shown(config)
     compile_kernels()
@@ -123,7 +123,7 @@ def line(name: str, recorded: RecordedEpisode) -> tuple[str, ...]:
 
 
 def show(path: Path) -> None:
-    """Open a file for a person at a display; elsewhere nothing happens."""
+    """Open a file if there is a display and a terminal; otherwise do nothing."""
     display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     opener = shutil.which("xdg-open")
     if display and opener and sys.stdout.isatty():

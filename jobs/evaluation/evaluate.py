@@ -1,9 +1,9 @@
-"""Evaluate the policy and the baselines in held-out corridors, and report how well each did.
+"""Evaluate the policy and the baselines in held-out corridors, and report the results.
 
 Run: python -m platform.launch +exp=evaluate
 Expect: about 2,000 control steps per second on each core. In the run folder under
 `eval/`: every episode (`episodes.csv`), the table with its intervals, trajectories seen from above
-and a video of one episode. A stopped evaluation continues; one that asks for more episodes adds the new ones.
+and a video of one episode. A stopped evaluation resumes; one with more episodes adds the new ones.
 """
 
 import dataclasses
@@ -75,13 +75,13 @@ def evaluate(
 ) -> dict[str, float]:
     """Evaluate every task, write tables, plots and a video, and return the metrics.
 
-    What was asked before, of the same policy, is done; tasks that failed then are tried again.
+    If the same policy was evaluated with the same settings, return those metrics, unless tasks failed then.
 
     Args:
         config: The experiment.
         folder: Its run folder.
         tracker: Its MLflow run.
-        executor: Computes the missing episodes; None: on all cores.
+        executor: Runs the missing episodes; None: on all cores.
 
     Raises:
         RuntimeError: A task of the first renderer failed.
@@ -120,11 +120,11 @@ def evaluate(
 
 
 def plan_evaluation(config: Config, policy: EvaluatedPolicy) -> list[EvaluationTask]:
-    """Return tasks: all agents in the held-out scene with the first renderer, and the policy with the others.
+    """Return the tasks: all agents in the held-out scene with the first renderer, the policy with the others.
 
-    A training in another scene than `poles` is evaluated there too, of which `poles_eval` says nothing. The
-    policy is evaluated with both choices of action, because they can differ by tens of points; the configured
-    one comes first and is the one that metrics without a suffix belong to.
+    A policy trained in another scene than `poles` is evaluated in that scene too, because `poles_eval` says
+    nothing about it. The policy is evaluated with both choices of action, because they can differ by tens of
+    points. The configured choice comes first, and metrics without a suffix belong to it.
     """
     first, *others = config.evaluate.renderers
     scenes = [HELD_OUT_SCENE, *{config.env.scene} - {HELD_OUT_SCENE, TRAINED_SCENE}]
@@ -142,7 +142,7 @@ def published(name: str) -> EvaluatedPolicy:
     """Return a policy of models/pretrained.
 
     Raises:
-        ConfigError: There is none of this name.
+        ConfigError: There is no policy of this name.
     """
     if not (PRETRAINED / name / MANIFEST).is_file():
         raise ConfigError(f"evaluate.beside: must be names in models/pretrained, got {name!r}")
@@ -152,17 +152,17 @@ def published(name: str) -> EvaluatedPolicy:
 def _task(
     config: Config, policy: EvaluatedPolicy, action: str, scene: str, renderer: Renderer
 ) -> EvaluationTask:
-    own = with_sensor(config.env, policy.sensor)  # the configured one, unless it is a published policy
+    own = with_sensor(config.env, policy.sensor)  # a published policy's own sensor, else the configured
     env = dataclasses.replace(own, scene=scene, split="eval", renderer=renderer)
     episodes = config.evaluate.episodes
-    if renderer == "pyrender":  # for another picture, not for one as exact as the tolerance asks
+    if renderer == "pyrender":  # a check with other pictures, which need not meet the tolerance
         env = dataclasses.replace(env, fidelity=dataclasses.replace(env.fidelity, samples=2))
         episodes = config.evaluate.pyrender_episodes
     return make_task((scene, renderer), policy, action, env, episodes)
 
 
 def label_of(task: EvaluationTask) -> Label:
-    """Agent, scene and renderer of a task; the run's policy is named by its choice of action."""
+    """Return agent, scene and renderer of a task; the run's policy is named by its choice of action."""
     agent = task.policy.agent
     if Path(agent).parent == PRETRAINED:
         return task.policy.name, *task.condition
@@ -172,7 +172,7 @@ def label_of(task: EvaluationTask) -> Label:
 def evaluate_all(
     tasks: Sequence[EvaluationTask], store: EpisodeStore, executor: Executor
 ) -> dict[Label, TaskResult]:
-    """Return the results of the tasks, without those that a second renderer cannot draw.
+    """Evaluate the tasks; return their results, without tasks that failed with another renderer.
 
     Raises:
         RuntimeError: A task of the first renderer failed.
@@ -187,7 +187,7 @@ def evaluate_all(
 
 
 def trajectories(tasks: Sequence[EvaluationTask]) -> list[Trajectory]:
-    """Trajectories of policy and oracle under the first condition; these episodes are rolled out again."""
+    """Return trajectories of policy and oracle under the first condition, from episodes rolled out again."""
     found = []
     shown = (tasks[0].policy.agent, tasks[0].action), ("oracle", "oracle")
     for task in tasks:
@@ -218,7 +218,7 @@ def publish(folder: Run, tracker: Tracker, summaries: Sequence[Summary], shown: 
 def evaluation_metrics(summaries: Sequence[Summary]) -> dict[str, float]:
     """Return all metrics of the first summary under their plain names, and two of others with a suffix.
 
-    The others are those of the same agent, and those of the same scene.
+    The others are the summaries of the same agent or the same scene.
     """
     found: dict[str, float] = {}
     first = summaries[0].label
@@ -232,7 +232,7 @@ def evaluation_metrics(summaries: Sequence[Summary]) -> dict[str, float]:
 
 
 def drift_by_label(results: Mapping[Label, TaskResult]) -> dict[str, float]:
-    """Return all drift metrics of the first task under plain names, and the drift of the policy's others."""
+    """Return all drift metrics of the first task under plain names, and `drift` of others with a suffix."""
     found: dict[str, float] = {}
     first = next(iter(results))
     for label, result in results.items():
@@ -243,19 +243,19 @@ def drift_by_label(results: Mapping[Label, TaskResult]) -> dict[str, float]:
 
 
 def metric_suffix(label: Sequence[str], first: Sequence[str]) -> str:
-    """Return the words in which a label differs from the first, for names of metrics: "_poles"."""
+    """Return the suffix of a label's metrics, "_poles": the words in which it differs from the first one."""
     words = [word for word, usual in zip(label, first, strict=True) if word != usual]
     return "".join(f"_{word.removeprefix('policy ')}" for word in words)
 
 
 def seed_to_film(episodes: np.ndarray) -> int:
-    """Choose the corridor to film: the first success of the policy, or else its longest episode."""
+    """Choose the corridor to film: the one where the policy got farthest, successes before failures."""
     order = np.lexsort((episodes["seed"], -episodes["distance_m"], ~episodes["success"]))
     return int(episodes["seed"][order[0]])
 
 
 def film_episode(name: str, action: str, env_config: EnvConfig, seed: int, path: Path) -> Path:
-    """Film an episode of a policy's folder, or of a baseline, in one corridor; return the file."""
+    """Film one episode of a policy folder or a baseline; return the file."""
     decode = latent_decoder(Path(name)) if (Path(name) / ENCODER).is_file() else None
     agent = make_agent(name, action)
     with open_film(path, env_config.control_hz, decode) as film:

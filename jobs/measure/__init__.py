@@ -1,1 +1,1 @@
-"""Jobs that measure what accuracy costs: of the simulator, of the encoder, and from end to end."""
+"""Jobs that measure the cost of accuracy: of the simulator, of the encoder, and end to end."""

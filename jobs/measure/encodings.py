@@ -1,4 +1,4 @@
-"""Cost of several ways to encode events, and the latent's error of each against float64 with exact time."""
+"""Measure cost and latent error of several ways to encode events, against float64 with exact times."""
 
 import copy
 import csv
@@ -23,13 +23,13 @@ TIME_BINS = (16, 64, 256, 1024, 4096, 65536)
 CAPS = (250, 500, 1000, 2000, 4096)
 CHUNKS = (1, 2, 5, 20)
 TIMED_WINDOWS = 8
-# Settings that leave the default as it is, for a model of 1,024 time bins and windows of up to 4,096 events.
+# Settings equal to the default, for a model with 1,024 time bins and windows of up to 4,096 events.
 UNCHANGED = (("default", ""), ("time bins", "1024"), ("newest events", "4096"), ("chunks", "1"))
 Encode = Callable[[Window], np.ndarray]
 
 
 class Encoding(NamedTuple):
-    """One way to encode a window: what was changed, to what, and the function to mu (latent,)."""
+    """One way to encode a window: the changed knob, its setting, and the function to mu (latent,)."""
 
     knob: str
     setting: str
@@ -47,7 +47,7 @@ def cost_values(row: Measured) -> tuple[str | float, ...]:
 
 
 def default_encodings(evae: EventVAE) -> list[Encoding]:
-    """Return the lookup table as it is used, the network itself, and the table with one setting changed."""
+    """Return the default lookup table, the plain network, and tables with one setting changed."""
     table = EncoderTable.from_evae(evae)
     forms = [("default", "", encode_whole(table)), ("torch", "plain network", encode_by_network(evae))]
     for precision in ("int16", "int8"):
@@ -62,17 +62,17 @@ def default_encodings(evae: EventVAE) -> list[Encoding]:
 
 
 def encode_whole(table: EncoderTable) -> Encode:
-    """Encode all events at once."""
+    """Return a function that encodes all events at once."""
     return lambda window: table.encode(*window)
 
 
 def encode_newest(table: EncoderTable, most: int) -> Encode:
-    """Encode the newest `most` events only."""
+    """Return a function that encodes only the newest `most` events."""
     return lambda window: table.encode(window[0][-most:], *window[1:])
 
 
 def encode_in_chunks(table: EncoderTable, count: int | None) -> Encode:
-    """`count` chunks, one after the other as a stream brings them; None: each event by itself."""
+    """Return a function that encodes `count` chunks in turn, like a stream; None: event by event."""
 
     def encode(window: Window) -> np.ndarray:
         events, start_us, window_us = window
@@ -85,7 +85,7 @@ def encode_in_chunks(table: EncoderTable, count: int | None) -> Encode:
 
 
 def encode_by_network(evae: EventVAE) -> Encode:
-    """Every event through the network, as published."""
+    """Return a function that sends every event through the network, as published."""
 
     @torch.no_grad()
     def encode(window: Window) -> np.ndarray:
@@ -97,7 +97,7 @@ def encode_by_network(evae: EventVAE) -> Encode:
 
 @torch.no_grad()
 def exact_latents(evae: EventVAE, windows: Sequence[Window]) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and standard deviation (B, latent) of the posterior, float64, times not rounded to bins.
+    """Return mean and standard deviation (B, latent) of the posterior, float64, times not rounded to bins.
 
     Raises:
         ValueError: The model's contexts are complex.
@@ -120,9 +120,9 @@ def exact_latents(evae: EventVAE, windows: Sequence[Window]) -> tuple[np.ndarray
 
 @torch.no_grad()
 def explained(evae: EventVAE, batch: EventBatch, mu: torch.Tensor | None = None) -> float:
-    """Share of the variance of the windows' pictures that the decoded ones explain (R2).
+    """Return the share of the variance of the windows' pictures that the decoded pictures explain (R2).
 
-    1 - squared error / squared error of the mean picture: 0 for the mean picture, 1 for perfection.
+    1 - squared error / squared error of the mean picture: 0 for the mean picture, 1 for perfect decoding.
 
     Args:
         evae: Frozen model.
@@ -144,16 +144,16 @@ def measure_encodings(
 ) -> list[Measured]:
     """Measure cost and accuracy of each encoding.
 
-    The cost is the process time per window of 2,000 events, the error the mean distance of mu from float64
-    with exact time, as share of the standard deviation of the posterior, over latents and windows. Outcomes
-    are the process time of one control step, the largest distance, and what the pictures decoded from this
-    mu explain, see `explained`.
+    The cost is the process time per window of 2,000 events. The error is the mean distance of mu from float64
+    with exact times, over latents and windows, in standard deviations of the posterior. Further outcomes are
+    the process time of one control step, the largest distance, and the variance that pictures decoded from
+    this mu explain (`explained`).
 
     Args:
-        encodings: What to measure.
+        encodings: The encodings to measure.
         windows: Held-out windows for the accuracy.
-        timed: Windows of one control step, and dense ones, for the cost.
-        rounds: Of timing.
+        timed: Windows of one control step, and dense windows, for the cost.
+        rounds: Rounds of timing.
         advance: Called with 1 after each encoding.
     """
     costs = costs_us(encodings, timed, rounds)
@@ -176,7 +176,7 @@ def costs_us(encodings: Sequence[Encoding], timed: tuple[list[Window], ...], rou
     """Return the process time per window [us], (encodings, kinds of windows), in interleaved rounds."""
     pairs = [(encoding.encode, windows[:TIMED_WINDOWS]) for encoding in encodings for windows in timed]
     work = {place: partial(_encode_all, *pair) for place, pair in enumerate(pairs)}
-    # The table comes back into the processor's cache, as in an episode.
+    # Load the table into the processor's cache, where it is during an episode.
     before = {place: partial(encode, windows[0]) for place, (encode, windows) in enumerate(pairs)}
     seconds = interleaved(work, rounds, time.process_time, before)
     costs = [1e6 * seconds[place] / len(windows) for place, (_, windows) in enumerate(pairs)]
@@ -189,7 +189,7 @@ def _encode_all(encode: Encode, windows: Sequence[Window]) -> None:
 
 
 def repeats(rows: Sequence[Measured]) -> list[Measured]:
-    """Return the default and the rows that compute the same; their costs differ only by timing noise."""
+    """Return the default and the rows that compute the same; their costs differ by timing noise only."""
     (default,) = (row for row in rows if row.knob == "default")
     return [row for row in rows if (row.knob, row.setting) in UNCHANGED and row.error == default.error]
 

@@ -1,18 +1,18 @@
-"""What a setting costs, how exact it is, and what else was measured of it."""
+"""Measurements of a setting: cost, error and other outcomes; the Pareto front of cost and error."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 
 class Measured(NamedTuple):
-    """One setting of a knob.
+    """Measurements of one setting of a knob.
 
     Attributes:
         knob: Name of the knob; "default" for the unchanged program.
         setting: The value, as text.
         cost_us: Process time of the unit of work [us].
         error: Distance from the exact result; 0 is exact.
-        outcome: Name -> other measured quantity.
+        outcome: Name -> value of other measured quantities.
     """
 
     knob: str
@@ -23,12 +23,12 @@ class Measured(NamedTuple):
 
 
 def name_of(knob: str, setting: str) -> str:
-    """Return knob and setting in one text; a knob within the setting is not repeated."""
+    """Return knob and setting as one text, without repeating a knob that the setting contains."""
     return setting if knob in setting else f"{knob} {setting}".strip()
 
 
 def columns(rows: Sequence[Measured]) -> dict[str, list[str | float]]:
-    """Return the columns of a tracker's table; the first is unique."""
+    """Return the rows as columns of a tracker's table; the first is unique."""
     named: dict[str, list[str | float]] = {
         "setting": [f"{row.knob} {row.setting}".strip() for row in rows],
         "cost_us": [row.cost_us for row in rows],
@@ -38,13 +38,13 @@ def columns(rows: Sequence[Measured]) -> dict[str, list[str | float]]:
 
 
 def pareto(points: Sequence[tuple[float, float]], noise: float = 0.0) -> list[int]:
-    """Return the places of the points that no other point beats in cost and error, by rising cost.
+    """Return the indices of the points that no other point beats in cost and error, by ascending cost.
 
     Args:
         points: Cost and error of each.
-        noise: Relative difference of repeated measurements of one cost. A point is beaten by one that is as
-            exact and cheaper by more than the noise, and by one that is more exact and not dearer beyond the
-            noise.
+        noise: Relative difference between repeated measurements of a cost. A point beats another if it is at
+            least as exact and cheaper by more than the noise, or more exact and not more expensive by more
+            than the noise.
     """
 
     def beats(ours: tuple[float, float], theirs: tuple[float, float]) -> bool:

@@ -1,4 +1,4 @@
-"""Plots of what accuracy costs: of the simulator, of the event encoder, and of both from end to end."""
+"""Plot the cost of accuracy: of the simulator, of the event encoder, and of both end to end."""
 
 from collections.abc import Callable, Mapping, Sequence
 
@@ -13,17 +13,17 @@ from jobs.measure.encodings import repeats
 from jobs.measure.measured import Measured, name_of
 from jobs.measure.trade_page import ALL, ENCODER_KNOBS, MARGIN
 
-MIN_ERROR = 1e-3  # that is drawn on a logarithmic axis
-# Where the labels of a knob stand from their points [points], so that near ones stay apart.
+MIN_ERROR = 1e-3  # smallest error on a logarithmic axis
+# Offset of a knob's labels from their points [points], so that labels do not overlap.
 LABELS = {
     "torch": ((0, 8), "center"),
     "precision": ((-5, 6), "right"),
     "newest events": ((-6, -3), "right"),
     "chunks": ((0, -13), "center"),
 }
-STYLES = (("o", "#2563eb"), ("^", "#d97706"), ("s", "#111827"))  # of scenes, told apart without colour too
-APART = 0.3  # of the scenes within a row of a trade
-# Panels of a trade: heading, columns of a value and of its interval's ends, and their scale.
+STYLES = (("o", "#2563eb"), ("^", "#d97706"), ("s", "#111827"))  # of scenes; markers differ too
+APART = 0.3  # distance of the scenes within a row of a trade
+# Panels of a trade: heading, columns with a value and the ends of its interval, and their scale.
 TRADED = (
     ("Speed, times the default's", ("speed", "speed_low", "speed_high"), 1),
     ("Events that differ [%]", ("event_error",) * 3, 100),
@@ -32,7 +32,7 @@ TRADED = (
 
 
 def plot_costs(scene: str, settings: Sequence[Measured], front: Sequence[int], tolerance: float) -> Figure:
-    """Draw a row for each setting: its cost and its event error; those of the front are named by a star."""
+    """Draw a row for each setting with its cost and event error; a star marks settings on the front."""
     figure = Figure(figsize=(9.6, 0.22 * len(settings) + 1.0), layout="constrained")
     panels = figure.subplots(1, 2, sharey=True)
     rows = range(len(settings))
@@ -67,10 +67,11 @@ def plot_memory_modes(rates_hz: Sequence[float], events_hz: Mapping[str, Sequenc
 
 
 def plot_encoding_costs(rows: Sequence[Measured]) -> Figure:
-    """Draw cost of 2,000 events against error of the latent, and what context sizes explain, if any.
+    """Draw cost of 2,000 events against latent error, and explained variance by context size, if measured.
 
-    A band spans the costs of the rows that compute the same: smaller differences may be noise. No front is
-    drawn, because noise would choose its points; no line joins context sizes, which have one training each.
+    A band spans the costs of rows that compute the same: smaller differences may be noise. The plot has no
+    front, because noise would choose its points, and no line between context sizes, which have a single
+    training each.
     """
     contexts = [row for row in rows if row.knob == "context"]
     ratios = (1.7, 1.0) if contexts else (1.0,)
@@ -117,9 +118,9 @@ def draw_rows(panel: Axes, rows: Sequence[Measured], height: Callable[[Measured]
 
 
 def draw_settings(settings: Sequence[Mapping[str, str]]) -> Figure:
-    """Draw what settings cost and give, from their published values (`trade_page.setting_values`).
+    """Draw speed, event error and change of success of settings from `trade_page.setting_values`.
 
-    A row is a setting, with its speed, its event error and the change of success in each scene.
+    A row is a setting; each scene has its own marker.
     """
     shown = [one for one in settings if one["policies"] == ALL]
     names = list(dict.fromkeys(map(_label, shown)))
@@ -141,7 +142,7 @@ def draw_settings(settings: Sequence[Mapping[str, str]]) -> Figure:
 
 
 def _label(one: Mapping[str, str]) -> str:
-    """Return a setting in words: what is varied stands before a bare value."""
+    """Return a setting in words; a bare value gets its knob as a prefix."""
     knob, setting = one["knob"], one["setting"]
     if knob in ENCODER_KNOBS and setting and " " not in setting:
         return f"{knob} {setting}"
@@ -149,7 +150,7 @@ def _label(one: Mapping[str, str]) -> str:
 
 
 def _dress(panels: Sequence[Axes], names: Sequence[str], front: set[str]) -> None:
-    """Name rows and axes of a trade, and mark the default's values and what success may lose."""
+    """Label rows and axes of a trade, and mark the default's values and the acceptable loss of success."""
     for panel, (heading, *_) in zip(panels, TRADED, strict=True):
         panel.set_xlabel(heading)
         panel.grid(axis="y", color="#e5e7eb", lw=0.6)

@@ -1,7 +1,7 @@
-"""What a setting changes on recorded episodes: events, latents, actions, and the cost of a step.
+"""Measure the effect of a setting on recorded episodes: events, latents, actions, and the cost of a step.
 
-A recorded episode is its corridor and its actions. Replayed under another setting, it visits the same
-places, so that every difference is due to the setting.
+A recorded episode consists of its corridor and its actions. Replayed under another setting, it visits the
+same places, so that every difference is due to the setting.
 """
 
 import time
@@ -20,18 +20,18 @@ from models.encoder.evae import EventVAE
 from models.encoder.event_batch import cut_packed
 from models.encoder.table import EncoderTable
 
-TURN = 50  # steps: a few hundredths of a second, in which a table is soon back in the cache
+TURN = 50  # steps: some hundredths of a second, long enough that reloading the cache hardly counts
 Setting = tuple[EnvConfig, PolicyAgent]
 
 
 class Replay(NamedTuple):
-    """One episode of T steps.
+    """One replayed episode of T steps.
 
     Attributes:
-        actions: What the agent chose at each step, int64 (T,).
-        windows: What it saw before each choice: packed windows int32 (rows, 4), T of them.
-        events: EVENT, all of the episode.
-        step_us: Mean process time of a step: the choice and the simulation [us].
+        actions: The agent's choice at each step, int64 (T,).
+        windows: The T packed windows that it saw before each choice, int32 (rows, 4).
+        events: All events of the episode, EVENT.
+        step_us: Mean process time of a step, choice and simulation [us].
     """
 
     actions: np.ndarray
@@ -48,9 +48,9 @@ class Measured(NamedTuple):
 
     Attributes:
         steps_us: Process time of a step in each episode [us].
-        event_error: Against the reference's events, see `envs.event_error`.
-        latent_error: Against the exact latents of the reference's events, see `latent_error`.
-        other_action: Share of steps at which the policy chooses another action than the reference.
+        event_error: Error against the reference's events, see `envs.event_error`.
+        latent_error: Error against the exact latents of the reference's events, see `latent_error`.
+        other_action: Share of steps with a different action than under the reference setting.
     """
 
     steps_us: tuple[float, ...]
@@ -60,7 +60,7 @@ class Measured(NamedTuple):
 
     @property
     def step_us(self) -> float:
-        """Process time of a step, median over episodes [us]."""
+        """Return the process time of a step, median over episodes [us]."""
         return float(np.median(self.steps_us))
 
 
@@ -69,7 +69,7 @@ class _Comparison(NamedTuple):
 
     step_us: float
     event_error: float
-    events: int  # of both
+    events: int  # of both replays together
     latents: np.ndarray
     others: np.ndarray
 
@@ -77,18 +77,18 @@ class _Comparison(NamedTuple):
 def measure_settings(
     settings: Sequence[Setting], evae: EventVAE, seeds: Sequence[int], advance: Callable[[int], None]
 ) -> list[Measured]:
-    """Record one episode per seed under the first setting, and replay it under each.
+    """Record one episode per seed under the first setting, and replay it under every setting.
 
-    The settings take turns every `TURN` steps, so that a busy machine slows all of them alike. A policy
-    that draws its actions draws the same random numbers under each.
+    The settings alternate every `TURN` steps, so that a busy machine slows all of them equally. A stochastic
+    policy draws the same random numbers under every setting.
 
     Args:
-        settings: Simulation and policy of each; the last one is the reference.
-        evae: The policy's encoder, for latents in float64 with exact time.
-        seeds: Of the corridors.
+        settings: Simulation and policy of each setting; the last one is the reference.
+        evae: The policy's encoder, for latents in float64 with exact times.
+        seeds: Seeds of the corridors.
         advance: Called with 1 for each setting and episode.
     """
-    for setting in settings:  # one turn that is not timed: a kernel may have to be loaded
+    for setting in settings:  # an untimed turn loads the compiled kernels
         first = steps(*setting, seeds[0])
         next(first, None)
         first.close()
@@ -123,7 +123,7 @@ def _mean(found: Sequence[_Comparison], exact: np.ndarray) -> Measured:
 
 
 def take_turns(episodes: Sequence[Episode], advance: Callable[[int], None]) -> list[Replay]:
-    """Run all episodes to their ends, one turn of each after the other; call `advance(1)` at each end."""
+    """Run all episodes to their ends in alternating turns; call `advance(1)` after each episode."""
     done: dict[int, Replay] = {}
     while len(done) < len(episodes):
         for place, episode in enumerate(episodes):
@@ -138,7 +138,7 @@ def take_turns(episodes: Sequence[Episode], advance: Callable[[int], None]) -> l
 
 
 def replay(config: EnvConfig, agent: PolicyAgent, seed: int, actions: np.ndarray | None = None) -> Replay:
-    """Run an episode of `steps` without interruption."""
+    """Run an episode of `steps` without interruption; return its replay."""
     return take_turns([steps(config, agent, seed, actions)], lambda count: None)[0]
 
 
@@ -147,10 +147,10 @@ def steps(config: EnvConfig, agent: PolicyAgent, seed: int, actions: np.ndarray 
 
     Args:
         config: The simulation.
-        agent: Chooses at every step; it remembers one episode at a time.
-        seed: Of the corridor.
-        actions: Executed in place of those that the agent chooses, int64 (T,); None: its own, until the
-            episode ends.
+        agent: Chooses an action at every step; it remembers one episode at a time.
+        seed: Seed of the corridor.
+        actions: Actions to execute instead of the agent's, int64 (T,). None: execute the agent's actions
+            until the episode ends.
     """
     env = CorridorEnv(config, observation=agent.observation)
     try:
@@ -177,7 +177,7 @@ def steps(config: EnvConfig, agent: PolicyAgent, seed: int, actions: np.ndarray 
 
 
 def latents_of(agent: PolicyAgent, windows: Sequence[np.ndarray]) -> np.ndarray:
-    """Latents (T, latent) that a policy's encoder makes of packed windows.
+    """Return the latents (T, latent) of packed windows by the policy's encoder.
 
     Raises:
         TypeError: The policy has no lookup table of single events.
@@ -189,10 +189,10 @@ def latents_of(agent: PolicyAgent, windows: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def latent_error(latents: np.ndarray, exact: np.ndarray) -> float:
-    """Root of the mean squared error of latents (T, latent), in standard deviations of the exact ones.
+    """Return the root mean squared error of latents (T, latent), in standard deviations of the exact ones.
 
-    Both are taken over all units together, so that a unit without information has no weight: 0
-    for the exact latents, 1 for their mean, which ignores the single step.
+    Error and deviation are taken over all units together, so that a unit without information has no weight.
+    The result is 0 for the exact latents, and 1 for their mean as a constant prediction.
     """
     deviation = float(np.sqrt(exact.var(axis=0).sum()))
     error = float(np.sqrt(np.square(latents - exact).sum(axis=1).mean()))

@@ -1,4 +1,4 @@
-"""Time pieces of work in turns, so that a slow minute of the machine affects all of them alike."""
+"""Time pieces of work in alternation, so that a slow minute of the machine affects all of them equally."""
 
 import time
 from collections.abc import Callable, Hashable, Mapping
@@ -15,13 +15,13 @@ def interleaved(
     clock: Callable[[], float] = time.perf_counter,
     before: Mapping[Name, Callable[[], object]] | None = None,
 ) -> dict[Name, float]:
-    """Return the median seconds of each piece of work. A first round, which compiles, does not count.
+    """Return the median time of each piece of work [s]. A first round, which compiles, does not count.
 
     Args:
-        work: Name -> the piece that is timed.
+        work: Name -> the piece to time.
         rounds: How often each piece is timed.
-        clock: Returns seconds: wall time, or `time.process_time` and the like.
-        before: Name -> what runs before each timing of the piece, not timed itself.
+        clock: Returns seconds of wall time or, like `time.process_time`, of process time.
+        before: Name -> untimed function to run before each timing of the piece.
     """
     taken: dict[Name, list[float]] = {name: [] for name in work}
     for _ in range(rounds + 1):

@@ -1,11 +1,10 @@
 """What exactness costs from end to end: for each setting of simulator and encoder, cost, errors and success.
 
 Run: python -m platform.launch +exp=trade
-Expect: by estimate an hour on two idle cores. In the run folder under `trade/`, and in
-MLflow, tables, a plot, and the page that says what to choose, which `+exp=report` puts into docs/.
-All trainings of `trade.policies` are evaluated in the same corridors of each scene under every setting. A
-stopped job continues when the same command is given again: no episode is evaluated twice; costs and errors
-are measured again.
+Expect: an estimated hour on two idle cores. In the run folder under `trade/`, and in MLflow: tables, a plot,
+and a page of recommendations, which `+exp=report` copies into docs/. All trainings of `trade.policies` are
+evaluated in the same corridors of each scene under every setting. To resume a stopped job, run the same
+command again: no episode is evaluated twice, but costs and errors are measured again.
 """
 
 import dataclasses
@@ -66,7 +65,7 @@ from models.policy.policy import ENCODER
 
 Condition = tuple[str, str]  # knob and setting
 
-# Knob of the simulator's trade -> which of its settings are evaluated: the whole of its span.
+# Knob of the simulator's trade -> the settings to evaluate, which span its range.
 SPANS = {
     "tolerance": slice(1, None),
     "renders": slice(2),
@@ -76,7 +75,7 @@ SPANS = {
     "culling": slice(None, None, 2),
     "memory": slice(None),
 }
-# Several at once, of the simulation and of the table; the paper's camera sees one 8-bit frame a step.
+# Combined changes of simulation and table. The paper's camera compares one 8-bit frame per step.
 TOGETHER: dict[str, tuple[Setting, Setting]] = {
     "coarse": ({"fidelity.tolerance": 0.5}, {"precision": PRECISIONS[-1]}),
     "the paper's camera": ({"camera.memory": "frame", "camera.encoding": "gamma8"}, {}),
@@ -85,14 +84,14 @@ TOGETHER: dict[str, tuple[Setting, Setting]] = {
 
 @dataclass(frozen=True, config=STRICT)
 class Settings:
-    """Which policies are evaluated under every setting of simulator and encoder, and in how many corridors.
+    """Policies to evaluate under every setting of simulator and encoder, and the number of corridors.
 
     Attributes:
         policies: Groups and names in models/pretrained, "newest", or paths.
-        scenes: Where.
+        scenes: Scenes to evaluate in.
         trials: Corridors of each training under each setting.
-        pyrender_trials: Corridors under the settings that pyrender draws.
-        replays: Episodes of each training on which costs and errors are measured.
+        pyrender_trials: Corridors under settings that render with pyrender.
+        replays: Episodes of each training for measuring costs and errors.
     """
 
     policies: Annotated[list[Name], Field(min_length=1)]
@@ -103,7 +102,7 @@ class Settings:
 
 
 def run(config: Config, executor: Executor | None = None) -> dict[str, float]:
-    """Evaluate and measure every setting, and say what to choose; return the first default's metrics.
+    """Evaluate and measure every setting, and write the page; return the first default's metrics.
 
     Args:
         config: The experiment.
@@ -146,13 +145,13 @@ def run(config: Config, executor: Executor | None = None) -> dict[str, float]:
 
 
 class Plan(NamedTuple):
-    """What a policy is evaluated under in a scene.
+    """Evaluation tasks of a policy in a scene.
 
     Attributes:
-        policy: Whose.
+        policy: The policy.
         evae: Its encoder.
-        scene: Where.
-        tasks: The default first, the most exact last; none twice.
+        scene: The scene.
+        tasks: One for each setting: the default first, the most exact last, without duplicates.
     """
 
     policy: EvaluatedPolicy
@@ -162,7 +161,7 @@ class Plan(NamedTuple):
 
 
 def find_encoder_policies(config: Config) -> list[EvaluatedPolicy]:
-    """Return the policies that are evaluated, each once.
+    """Return the policies to evaluate, each once.
 
     Raises:
         ConfigError: If `trade.policies` names none, or one without a frozen encoder of single events.
@@ -180,7 +179,7 @@ def find_encoder_policies(config: Config) -> list[EvaluatedPolicy]:
 
 
 def plan(config: Config, policy: EvaluatedPolicy, scene: str) -> Plan:
-    """Return the settings of a policy in a scene as tasks.
+    """Return the evaluation tasks of a policy in a scene, one for each setting.
 
     Raises:
         ConfigError: If the policy's own sensor and a setting exclude each other.
@@ -203,13 +202,13 @@ def plan(config: Config, policy: EvaluatedPolicy, scene: str) -> Plan:
 
 
 def changes(timed: bool) -> list[tuple[str, str, Setting, Setting]]:
-    """Return the changes: none, each setting of the simulator, each of the encoder, and several at once.
+    """Return the changes to evaluate: none, each setting of simulator and encoder, and combinations.
 
     Args:
-        timed: Whether the encoder sees time.
+        timed: Whether the encoder uses event times.
 
     Returns:
-        Knob, setting, what changes in the simulation, what in the encoder's table.
+        Knob, setting, changes of the simulation, changes of the encoder's table.
     """
     found: list[tuple[str, str, Setting, Setting]] = [(DEFAULT, "", {}, {})]
     for knob, span in SPANS.items():
@@ -241,7 +240,7 @@ def _task(
 def measure_plans(
     config: Config, plans: Sequence[Plan], results: Mapping[str, TaskResult]
 ) -> list[list[TradedSetting]]:
-    """Measure the rows of each scene: evaluated success, cost, and errors on recorded episodes."""
+    """Return the rows of each scene: evaluated success, and measured cost and errors on recorded episodes."""
     able = [own._replace(tasks=[task for task in own.tasks if task.key in results]) for own in plans]
     seeds = range(config.own.replays)
     total = len(seeds) * sum(len(own.tasks) for own in able)
@@ -251,13 +250,13 @@ def measure_plans(
     for scene in dict.fromkeys(config.own.scenes):
         here = [(own, costs) for own, costs in zip(able, measured, strict=True) if own.scene == scene]
         conditions = dict.fromkeys(task.condition for own, _ in here for task in own.tasks)
-        order = sorted(conditions, key=lambda condition: condition[0] == EXACT)  # that of a plan is the last
+        order = sorted(conditions, key=lambda condition: condition[0] == EXACT)  # the most exact last
         found.append([traded_setting(condition, here, results) for condition in order])
     return found
 
 
 def _measured(own: Plan, seeds: Sequence[int], advance: Callable[[int], None]) -> dict[Condition, Measured]:
-    """Cost and errors of each setting of a plan."""
+    """Measure cost and errors of each setting of a plan."""
     agents = [make_agent(task.policy.agent, task.action, task.table) for task in own.tasks]
     settings = [(task.env, cast(PolicyAgent, agent)) for task, agent in zip(own.tasks, agents, strict=True)]
     measured = measure_settings(settings, own.evae, seeds, advance)
@@ -269,12 +268,12 @@ def traded_setting(
     plans: Sequence[tuple[Plan, Mapping[Condition, Measured]]],
     results: Mapping[str, TaskResult],
 ) -> TradedSetting:
-    """Return the row of a setting in a scene, compared with the default of the same trainings.
+    """Return the row of a setting in a scene, compared with the default setting of the same trainings.
 
     Args:
         condition: Knob and setting.
-        plans: Of all policies in the scene, with cost and errors of their settings.
-        results: Of all tasks.
+        plans: Plans of all policies in the scene, with cost and errors of their settings.
+        results: Key of a task -> its result.
     """
     ratios: list[float] = []
     costs: list[Measured] = []
@@ -307,14 +306,14 @@ def traded_setting(
 
 
 def _outcome(pairs: Sequence[tuple[np.ndarray, np.ndarray]], other_action: Sequence[float]) -> Outcome:
-    """Compare the successes of each training with its default in the same corridors."""
+    """Compare the success of each training with its default in the same corridors."""
     reached, usual = (np.stack(part).astype(np.float64) for part in zip(*pairs, strict=True))
     difference = crossed_mean(reached - usual, (-1.0, 1.0))
     return Outcome(len(pairs), reached.size, rate_estimate(reached), difference, float(np.mean(other_action)))
 
 
 def speed_ratio(ratios: Sequence[float]) -> Estimate:
-    """Geometric mean of repeated ratios of two times, with Student's interval of their logarithms."""
+    """Return the geometric mean of repeated time ratios, with Student's interval of their logarithms."""
     logs = np.log(ratios)
     if len(logs) < 2:
         return Estimate(float(np.exp(logs[0])), None)
@@ -323,7 +322,7 @@ def speed_ratio(ratios: Sequence[float]) -> Estimate:
 
 
 def facts_of(folder: Run, policies: Sequence[EvaluatedPolicy], failed: Mapping[str, str]) -> TradeFacts:
-    """Return where the numbers come from."""
+    """Return the provenance of the numbers."""
     trade = folder.config.own
     return {
         "run": folder.path.name,
@@ -342,7 +341,7 @@ def facts_of(folder: Run, policies: Sequence[EvaluatedPolicy], failed: Mapping[s
 
 
 def met_fidelity(policies: Sequence[EvaluatedPolicy]) -> dict[str, list[str]]:
-    """Group -> settings of `fidelity` that its trainings drew beside the default."""
+    """Return group -> settings of `fidelity` that its trainings drew in addition to the default."""
     found: dict[str, dict[str, None]] = {}
     for policy in policies:
         for condition in policy.conditions:
@@ -376,4 +375,4 @@ def write_trade(folder: Run, tracker: Tracker, rows: Sequence[TradedSetting], fa
         for group in row.outcomes
     ]
     write_child_runs(tracker, "setting", children)
-    write_json(place / "about.json", facts)  # the last: it says that the rest is there
+    write_json(place / "about.json", facts)  # written last: it marks the trade as complete

@@ -1,8 +1,8 @@
 """Measure what accuracy of the event encoder costs.
 
 Run: python -m platform.launch +exp=trade_encoder
-Expect: a minute on one core beyond the run's own encoder. A table and its plot, in the run folder under
-`trade/` and in MLflow.
+Expect: a minute on one core, plus the training of the run's encoder. A table and its plot, in the run folder
+under `trade/` and in MLflow.
 """
 
 import dataclasses
@@ -51,17 +51,17 @@ HEADINGS = (
 
 @dataclass(frozen=True, config=STRICT)
 class Settings:
-    """How many held-out windows, and how many rounds of timing."""
+    """Number of held-out windows, and of rounds of timing."""
 
     windows: Annotated[int, Field(ge=4)]
     rounds: Count
 
 
 def run(config: Config) -> dict[str, float]:
-    """Train the run's encoder if there is none yet, then measure; return the metrics.
+    """Train the run's encoder if it does not exist yet, then measure; return the metrics.
 
     Raises:
-        ConfigError: The policy has no encoder that reads events one by one.
+        ConfigError: The policy has no encoder of single events.
     """
     model = locate_run(config).config.model
     if model.name not in EVENT_ENCODERS:
@@ -82,7 +82,7 @@ def run(config: Config) -> dict[str, float]:
 
 
 def trade_inference(folder: Run, tracker: Tracker, evae: EventVAE) -> dict[str, float]:
-    """Measure cost against error of every way to encode; return the metrics of the default."""
+    """Measure cost and error of every encoding; return the metrics of the default."""
     config, trade = folder.config, folder.config.own
     validation = read_recording(data_file(folder, "validation"))
     usual = draw(config, validation, "mixed", MAX_EVENTS, trade.windows)
@@ -110,9 +110,10 @@ def trade_inference(folder: Run, tracker: Tracker, evae: EventVAE) -> dict[str, 
 def draw(
     config: Config, recording: Recording, windows: Literal["mixed", "count"], most_events: int, count: int
 ) -> list[Window]:
-    """`count` fixed windows: "mixed" lengths, or "count", those of `most_events` events.
+    """Return `count` fixed windows, of "mixed" lengths or, for "count", of `most_events` events each.
 
-    At the end of an episode a window by count holds fewer; of four times as many the fullest are kept.
+    A window of a fixed count holds fewer events at the end of an episode. So four times as many windows are
+    drawn, and the fullest are returned.
     """
     settings = dataclasses.replace(config.pretrain, windows=windows, window_events=most_events)
     rng = np.random.default_rng(1)
@@ -123,7 +124,7 @@ def draw(
 
 
 def control_steps(recording: Recording, count: int) -> list[Window]:
-    """`count` fixed windows of one control step."""
+    """Return `count` fixed windows of one control step each."""
     start, end = recording.index["step_t_us"], recording.index["step_end_us"]
     chosen = np.random.default_rng(1).choice(len(start), count)
     spans = [(int(start[step]), int(end[step] - start[step])) for step in chosen]

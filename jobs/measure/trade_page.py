@@ -1,4 +1,4 @@
-"""The page that says which setting to choose: settings as rows, a verdict for each by a stated rule."""
+"""Write the page that recommends settings: a row per setting, with a verdict by a stated rule."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -12,13 +12,13 @@ from jobs.measure.measured import name_of
 from jobs.run.provenance import Provenance
 from jobs.run.templates import render
 
-TEMPLATE = Path(__file__).with_name("trade_page.md.j2")  # it also states the rule of the verdicts
+TEMPLATE = Path(__file__).with_name("trade_page.md.j2")  # also states the rule for the verdicts
 DEFAULT, EXACT = "default", "most exact"
-ENCODER_KNOBS = ("precision", "time bins", "newest events")  # they change no event
-CAMERA_KNOB = "memory"  # another camera, not a coarser simulation of the same
-OTHER_CAMERAS = ("the paper's camera",)  # of the settings that change several things
-MARGIN = 0.1  # of success: what may be lost
-ALL = "all"  # in the published settings: all trainings together
+ENCODER_KNOBS = ("precision", "time bins", "newest events")  # these do not change events
+CAMERA_KNOB = "memory"  # a different camera, not a coarser simulation of the same one
+OTHER_CAMERAS = ("the paper's camera",)  # combined settings with a different camera
+MARGIN = 0.1  # acceptable loss of success
+ALL = "all"  # group name for all trainings together in the published settings
 SETTING_FIELDS = (
     "scene", "knob", "setting", "policies", "trainings", "episodes", "steps_per_s",
     "speed", "speed_low", "speed_high", "event_error", "latent_error", "other_action",
@@ -29,7 +29,7 @@ Verdict = Literal["default", "as good", "worse", "undecided"]
 
 
 class TradeFacts(Provenance):
-    """What made the numbers of a trade: command, commit, machine and date, policies and corridors."""
+    """Provenance of a trade: command, commit, machine and date, policies and corridors."""
 
     run: str
     command: str
@@ -45,14 +45,14 @@ class TradeFacts(Provenance):
 
 
 class Outcome(NamedTuple):
-    """What trainings reach under a setting in the corridors of a scene.
+    """Results of trainings under a setting in a scene.
 
     Attributes:
-        trainings: How many.
-        episodes: Of all of them.
-        success: Rate of episodes that reach the goal.
-        difference: Of it, to the default with the same trainings in the same corridors.
-        other_action: Share of steps at which they choose another action than on converged events.
+        trainings: Number of trainings.
+        episodes: Number of episodes of all trainings.
+        success: Success rate.
+        difference: Difference of success to the default setting, paired by training and corridor.
+        other_action: Share of steps with a different action than on converged events.
     """
 
     trainings: int
@@ -66,14 +66,14 @@ class TradedSetting(NamedTuple):
     """One setting of the simulator or the encoder in one scene.
 
     Attributes:
-        scene: Where.
-        knob: What is varied.
-        setting: To what.
-        step_us: Process time of an environment step with the policy's choice, median [us].
-        speed: Times that of the default, with the interval over repeated timings.
-        event_error: Against converged events.
-        latent_error: Root mean square, in standard deviations of the exact latents.
-        outcomes: Group -> what its trainings reach; under `ALL` those of all.
+        scene: Name of the scene.
+        knob: Name of the varied knob.
+        setting: Value of the knob.
+        step_us: Median process time of an environment step including the policy's choice [us].
+        speed: Speed relative to the default, with an interval over repeated timings.
+        event_error: Error against converged events.
+        latent_error: Root mean square error, in standard deviations of the exact latents.
+        outcomes: Group -> results of its trainings; `ALL` -> results of all trainings.
     """
 
     scene: str
@@ -87,17 +87,17 @@ class TradedSetting(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Knob and setting in one, such as "precision int8"; the knob is not said twice."""
+        """Return knob and setting as one text, such as "precision int8", without repeating the knob."""
         return name_of(self.knob, self.setting)
 
     @property
     def steps_per_s(self) -> float:
-        """Environment steps a second on one core, with the policy's choice."""
+        """Return the environment steps per second on one core, including the policy's choice."""
         return 1e6 / self.step_us
 
     @property
     def known_error(self) -> float | None:
-        """Event error; None for a setting that changes no event."""
+        """Return the event error; None for a setting that does not change events."""
         return None if self.knob in ENCODER_KNOBS else self.event_error
 
     @property
@@ -107,7 +107,7 @@ class TradedSetting(NamedTuple):
 
 
 def verdicts(rows: Sequence[TradedSetting]) -> list[Verdict]:
-    """Return a verdict for each row, by the rule that the page states; `rows` are the family of the tests."""
+    """Return a verdict for each row by the rule stated on the page; all `rows` form one family of tests."""
     tested = [row.together.difference.p for row in rows if row.knob != DEFAULT]
     adjusted = iter(holm([1.0 if p is None else p for p in tested]))
     return [_verdict(row, 1.0 if row.knob == DEFAULT else next(adjusted)) for row in rows]
@@ -125,7 +125,7 @@ def _verdict(row: TradedSetting, p: float) -> Verdict:
 
 
 def on_front(rows: Sequence[TradedSetting]) -> list[bool]:
-    """Return the settings of a scene that no other beats: at least as exact, and significantly faster."""
+    """Mark the settings of a scene that no other beats by being as exact and significantly faster."""
     return [
         row.known_error is not None
         and not any(
@@ -139,12 +139,12 @@ def on_front(rows: Sequence[TradedSetting]) -> list[bool]:
 
 
 def _ends(speed: Estimate) -> Interval:
-    """Return the interval of a speed; of a single timing nothing is known."""
+    """Return the interval of a speed; 0 to infinity for a single timing."""
     return speed.interval or (0.0, float("inf"))
 
 
 def setting_values(rows: Sequence[TradedSetting]) -> list[dict[str, str]]:
-    """Return the published values of each setting, by `SETTING_FIELDS`: a line per group and one for all."""
+    """Return the published values as `SETTING_FIELDS` -> text: a line per setting and group, and for all."""
     fronts = [front for own in by_scene(rows) for front in on_front(own)]
     found = []
     for row, verdict, front in zip(rows, verdicts(rows), fronts, strict=True):
@@ -163,7 +163,7 @@ def setting_values(rows: Sequence[TradedSetting]) -> list[dict[str, str]]:
 
 
 def by_scene(rows: Sequence[TradedSetting]) -> list[list[TradedSetting]]:
-    """Return the rows of each scene."""
+    """Group the rows by scene."""
     scenes = dict.fromkeys(row.scene for row in rows)
     return [[row for row in rows if row.scene == scene] for scene in scenes]
 
@@ -177,7 +177,7 @@ def headings(groups: Sequence[str]) -> tuple[str, ...]:
 
 
 def trade_lines(rows: Sequence[TradedSetting], groups: Sequence[str]) -> list[tuple[str, ...]]:
-    """Return the rows as text, one for each of `headings`; all rows are the family of the verdicts."""
+    """Return the rows as texts under `headings`; all rows form one family for the verdicts."""
     return [
         (
             row.knob,
@@ -203,12 +203,12 @@ def _reached(row: TradedSetting, group: str) -> tuple[str, str]:
 
 
 def points_text(difference: Difference) -> str:
-    """Return a difference of rates in points, with its interval."""
+    """Return a difference of rates with its interval as text [points]."""
     return estimate_text(difference, 100, "+.0f")
 
 
 def trade_metrics(row: TradedSetting, group: str = ALL) -> dict[str, float]:
-    """Return the metrics of a row under the tracker's names, without values that were not measured."""
+    """Return the metrics of a row under the tracker's names, without values that are NaN."""
     outcome = row.outcomes[group]
     values = {
         "perf/env_steps_per_second": row.steps_per_s,
@@ -224,11 +224,11 @@ def trade_metrics(row: TradedSetting, group: str = ALL) -> dict[str, float]:
 
 
 class Choice(NamedTuple):
-    """One setting in all scenes: its rows, and what they say together.
+    """One setting in all scenes: its rows, and their common verdict.
 
     Attributes:
         rows: One for each scene.
-        verdict: "as good" where it is in each scene, "worse" where it is in one, else "undecided".
+        verdict: The verdict of the scenes if they agree; else "worse" if so in any scene, or "undecided".
     """
 
     rows: tuple[TradedSetting, ...]
@@ -241,17 +241,17 @@ class Choice(NamedTuple):
 
     @property
     def speed(self) -> float:
-        """Geometric mean over the scenes of the speed, times the default's."""
+        """Return the geometric mean over the scenes of the speed relative to the default."""
         return float(np.exp(np.mean([np.log(row.speed.value) for row in self.rows])))
 
     @property
     def is_faster(self) -> bool:
-        """Beyond doubt, in each scene."""
+        """Whether the setting is significantly faster than the default in every scene."""
         return all(_ends(row.speed)[0] > 1.0 for row in self.rows)
 
 
 def choices(rows: Sequence[TradedSetting]) -> list[Choice]:
-    """Return the settings that all scenes have, in the order of the rows."""
+    """Return the settings that are present in all scenes, in the order of the rows."""
     found: dict[tuple[str, str], list[tuple[TradedSetting, Verdict]]] = {}
     for row, verdict in zip(rows, verdicts(rows), strict=True):
         found.setdefault((row.knob, row.setting), []).append((row, verdict))
@@ -266,15 +266,16 @@ def _joined(several: Sequence[Verdict]) -> Verdict:
 
 
 class Advice(NamedTuple):
-    """Which settings to choose, and which not.
+    """Settings to choose, and settings to avoid.
 
     Attributes:
-        fastest: The fastest that is as good as the default, with the same camera; None: none is faster.
-        coarsest: Of the default and those as good, the one with the largest event error, same camera.
-        encoder: The fastest setting of the encoder that is as good; None: none is faster.
-        cameras: Settings that are another camera.
-        worse: Settings that are known to cost success.
-        undecided: Settings of which too little is known.
+        fastest: The fastest setting as good as the default, with the same camera; None: none is faster.
+        coarsest: The setting with the largest event error among the default and settings as good, with the
+            same camera.
+        encoder: The fastest encoder setting as good as the default; None: none is faster.
+        cameras: Settings with a different camera.
+        worse: Settings that significantly reduce success.
+        undecided: Settings without a decision.
     """
 
     fastest: Choice | None
@@ -308,11 +309,11 @@ def advise(rows: Sequence[TradedSetting]) -> Advice:
 
 
 def trade_page(about: TradeFacts, rows: Sequence[TradedSetting]) -> str:
-    """Return the page: advice, plot, the settings that the advice names, what was evaluated.
+    """Return the page: advice, plot, the settings named in the advice, and how they were evaluated.
 
     Args:
-        about: What made the numbers.
-        rows: Scene after scene, as everywhere here; in each the default first, the most exact last.
+        about: Provenance of the numbers.
+        rows: All rows, scene by scene; in each scene the default first, the most exact setting last.
     """
     advice = advise(rows)
     return render(
@@ -328,7 +329,7 @@ def trade_page(about: TradeFacts, rows: Sequence[TradedSetting]) -> str:
 
 
 def advice_table(advice: Advice, every: Sequence[Choice]) -> str:
-    """Return a row for the default, each setting that the advice names, and the most exact one."""
+    """Return a table of the default, the settings named in the advice, and the most exact setting."""
     best = [advice.fastest, advice.encoder, advice.coarsest]
     named = [*best, *advice.cameras, *advice.worse, *advice.undecided]
     shown = [one for one in every if one in named or one in (every[0], every[-1])]

@@ -1,10 +1,10 @@
 """What exact events cost: every knob of the simulator, its cost against its event error.
 
 Run: python -m platform.launch +exp=trade_simulator
-Expect: about a minute on one core. A table and a plot per scene with the default and what no other
-setting betters marked, and the events of each memory mode at each control rate, in the run folder
-under `trade/` and in MLflow. An event error is measured against the converged simulation of
-the same flights, see `envs.event_error`; a cost is process time of `CorridorEnv.step`.
+Expect: about a minute on one core. A table and a plot per scene, which mark the default and the settings that
+no other setting beats, and the events of each memory mode at each control rate; in the run folder under
+`trade/` and in MLflow. The event error is measured against the converged simulation of the same flights, see
+`envs.event_error`. The cost is process time of `CorridorEnv.step`.
 """
 
 import dataclasses
@@ -33,7 +33,7 @@ from jobs.tracking.tracker import Tracker, open_tracker
 
 Setting = Mapping[str, float | str]  # key of the simulation -> value
 MEMORIES = ("reference", "frame", "legacy")
-# Knob -> settings of it; every other setting is the default's. Renders are per default control step.
+# Knob -> its settings; all other settings are the default's. Renders are per default control step.
 KNOBS: dict[str, list[Setting]] = {
     "tolerance": [{"fidelity.tolerance": value} for value in (0.01, 0.02, 0.1, 0.2, 0.5)],  # 0.05: default
     "renders": [{"renders": value} for value in (1, 2, 3, 4, 6, 8, 16)],
@@ -43,17 +43,17 @@ KNOBS: dict[str, list[Setting]] = {
     "culling": [{"fidelity.cull_m": value} for value in (20.0, 30.0, 50.0, 70.0)],
     "memory": [{"camera.memory": value} for value in MEMORIES[1:]],
 }
-NOISE = 0.05  # share by which the cost of one simulation differs when it is measured again
+NOISE = 0.05  # relative difference between repeated measurements of a cost
 HEADINGS = ("Knob", "Setting", "Cost [us/step]", "Event error [%]", "Events/step", "Renders/step", "Best")
 
 
 @dataclass(frozen=True, config=STRICT)
 class Settings:
-    """Where the simulator's event error is measured, and how often its cost.
+    """Settings for measuring the simulator's event error and cost.
 
     Attributes:
-        flights: Corridors in which errors are measured.
-        steps: Control steps in each of them, and in each round of timing.
+        flights: Number of corridors for measuring errors.
+        steps: Control steps in each corridor, and in each round of timing.
         rounds: Rounds of timing.
     """
 
@@ -116,7 +116,7 @@ def trade_memory(folder: Run, tracker: Tracker) -> dict[str, float]:
     events_hz: dict[str, list[float]] = {memory: [] for memory in MEMORIES}
     with progress("Memory modes", len(rates_hz) * len(MEMORIES), "simulations") as advance:
         for hz in rates_hz:
-            # The same way at every rate: as many steps as fit into the time of the slowest.
+            # The same distance at every rate: the number of steps is proportional to the rate.
             steps = max(1, round(trade.steps * hz / min(rates_hz) / 4))
             for memory in MEMORIES:
                 default = dataclasses.replace(config.env, control_hz=hz, split="validation")
@@ -155,7 +155,7 @@ def _take_steps(env: CorridorEnv, steps: int) -> None:
 
 
 def changed(default: EnvConfig, setting: Setting) -> EnvConfig:
-    """Return the default with some settings replaced; "renders" is a number per control step."""
+    """Return the default with some settings replaced; "renders" is the number of renders per control step."""
     for key, value in setting.items():
         if key == "renders":
             step_m = default.speed_mps / default.control_hz

@@ -1,1 +1,1 @@
-"""A run on disk and on a machine: its folder, files, checkpoints, progress, and Ray."""
+"""Run folders, their files and checkpoints, progress output, and Ray."""

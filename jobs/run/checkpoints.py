@@ -1,7 +1,7 @@
-"""Checkpoints of a training that are known to be whole: sealed when written, checked before use.
+"""Seal the checkpoints of a training when they are written, and check them before use.
 
-A power failure, a full disk or an interrupted copy leaves files that look right. A checkpoint that
-differs from what was written is replaced by the newest one that does not.
+A power failure, a full disk or an interrupted copy leaves files that look intact. A checkpoint that has
+changed since it was written is replaced by the newest intact one.
 """
 
 import contextlib
@@ -15,18 +15,18 @@ from jobs.run.files import RunError, read_json, write_json
 
 SEAL = "sha256.json"
 UNSEALED = "not sealed"
-UNFINISHED = ".checkpoint-"  # begins the names of folders that checkpoints are made in; `mend` sees none
+UNFINISHED = ".checkpoint-"  # prefix of folders of incomplete checkpoints; `mend` ignores them
 
 
 @contextlib.contextmanager
 def unfinished(place: Path | None) -> Iterator[str]:
     """Yield a folder for a new checkpoint, next to the finished ones; remove it when the block ends.
 
-    Not in the system's temporary folder, which may be memory, or have less room.
+    The system's temporary folder may be in memory or have less space, so it is avoided.
 
     Args:
-        place: The folder of the finished ones, made if it is missing; None: there is none on this machine,
-            and the system's temporary folder has to do.
+        place: Folder of the finished checkpoints, created if missing; None if it is not on this machine: the
+            system's temporary folder is used.
     """
     if place is not None:
         place.mkdir(exist_ok=True)
@@ -46,9 +46,9 @@ def seal(checkpoint: Path) -> None:
 
 
 def damage(checkpoint: Path) -> str | None:
-    """Return what is wrong with a checkpoint, in a few words; None if it is as it was written.
+    """Return in a few words what is wrong with a checkpoint; None if it is intact.
 
-    A checkpoint has no seal if the process was killed before it wrote one: it may be whole or not.
+    A checkpoint has no seal if the process was killed before writing it. Such a checkpoint may be intact.
     """
     if not checkpoint.is_dir():
         return "missing"
@@ -64,15 +64,15 @@ def damage(checkpoint: Path) -> str | None:
 
 
 def mend(checkpoint: Path) -> str | None:
-    """Replace a damaged checkpoint by the newest whole one; return what was done, None if nothing.
+    """Replace a damaged checkpoint by the newest intact one; return a message, None if nothing was done.
 
-    One without a seal, which may be whole, is taken only if none has a seal.
+    A checkpoint without a seal, which may be intact, is used only if no sealed one is intact.
 
     Args:
-        checkpoint: The one that a training would continue from, `checkpoint_<number>`.
+        checkpoint: The checkpoint from which a training would continue, `checkpoint_<number>`.
 
     Raises:
-        RunError: There is no whole one.
+        RunError: No checkpoint is intact.
     """
     reason = damage(checkpoint)
     if reason is None:
@@ -103,6 +103,6 @@ def sha256(file: Path) -> str:
 
 
 def _digests(checkpoint: Path) -> dict[str, str]:
-    """Return file -> SHA-256, without the seal."""
+    """Return file name -> SHA-256 for every file except the seal."""
     files = (path for path in sorted(checkpoint.rglob("*")) if path.is_file())
     return {str(path.relative_to(checkpoint)): sha256(path) for path in files if path != checkpoint / SEAL}

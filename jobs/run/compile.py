@@ -1,10 +1,10 @@
-"""Compiles the kernels into numba's cache, by using each once: python -m jobs.run.compile [all].
+"""Compile the kernels into numba's cache by calling each once: python -m jobs.run.compile [all].
 
-Without `all` it compiles what the default commands use: demonstration, training, evaluation. numba compiles
-the others when they are first used. What is compiled already is only loaded, and nothing is done while no
-source file has changed. A clone takes what another clone of the same sources has compiled on this machine.
-One job compiles, in two processes; others that are started meanwhile wait for it. The rooms are imported
-only where there is something to compile, because that takes seconds.
+Without `all`, only the kernels of the default commands are compiled: demonstration, training, evaluation.
+numba compiles the others at their first call. Nothing is done until a source file changes. A clone reuses
+kernels that another clone of the same sources has compiled on this machine. One job compiles, in two
+processes; jobs that are started meanwhile wait for it. The packages are imported only if there is something
+to compile, because importing them takes seconds.
 """
 
 import contextlib
@@ -37,20 +37,20 @@ from jobs.run.provenance import REPOSITORY
 
 ROOMS = ("core", "envs", "models")
 CACHE = REPOSITORY / "envs" / "__pycache__"
-ARCHIVES = 8  # of compiled kernels, 10 MB each, that stay in the user's cache
+ARCHIVES = 8  # most archives of compiled kernels in the user's cache, 10 MB each
 
 
 def compile_kernels() -> None:
-    """Compile in a separate process, before several processes start that would each compile.
+    """Compile the kernels in a separate process, before several processes start that would each compile.
 
-    Nothing is done where the folder of the source cannot be written: numba then compiles elsewhere.
+    Do nothing if the source folder is not writable: numba then caches kernels elsewhere.
     """
     if not _is_current("first") and os.access(CACHE.parent, os.W_OK):
         subprocess.run([sys.executable, "-m", "jobs.run.compile"], cwd=REPOSITORY, check=False)
 
 
 def main(which: str = "first") -> None:
-    """Compile what has changed since the last time, and say how long it took.
+    """Compile what has changed since the last call, and print how long it took.
 
     Args:
         which: `first` for what the default commands use, `all` for every kernel.
@@ -72,7 +72,7 @@ def main(which: str = "first") -> None:
 
 
 def _is_current(which: str) -> bool:
-    """Whether these kernels, or all, are compiled from the present sources."""
+    """Whether these kernels, or all kernels, were compiled from the current sources."""
     now = _digest()
     files = (CACHE / f"compiled_{name}" for name in {which, "all"})
     return any(file.is_file() and file.read_text() == now for file in files)
@@ -89,7 +89,7 @@ def _digest() -> str:
 
 
 def _archive(name: str) -> Path:
-    """Return the archive in which this user's other clones find the kernels of a digest."""
+    """Return the path of an archive of kernels in the user's cache, which all clones share."""
     cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(cache, "evade", "kernels", f"{name}.zip")
 
@@ -110,12 +110,12 @@ def pack(archive: Path) -> None:
 
 
 def unpack(archive: Path) -> bool:
-    """Take the kernels of another clone; return whether there were any."""
-    for room in ROOMS:  # later it would take what is unpacked for stale
+    """Unpack the kernels of another clone; return whether there were any."""
+    for room in ROOMS:  # later, it would delete the unpacked kernels as stale
         forget_stale_kernels(REPOSITORY / room)
     try:
         with zipfile.ZipFile(archive) as file:
-            # A kernel has one `.nbi`, which names its `.nbc`, and so comes after them.
+            # The index of a kernel, `.nbi`, names its `.nbc` files, so it is written after them.
             for name in sorted(file.namelist()):
                 target = REPOSITORY / name
                 index = re.sub(r"(\.\d+\.nbc|\.nbi)$", ".nbi", target.name)
@@ -129,14 +129,14 @@ def unpack(archive: Path) -> bool:
 
 
 def side_by_side(parts: Sequence[Callable[[], None]]) -> None:
-    """Call functions of modules, each in a process of its own."""
+    """Call module-level functions in parallel, each in its own process."""
     with ProcessPoolExecutor(len(parts), get_context("spawn")) as pool:
         for done in [pool.submit(part) for part in parts]:
             done.result()
 
 
 def draw() -> None:
-    """Draw a scene."""
+    """Render a scene."""
     from envs.raycast.renderer import RaycastRenderer
     from envs.scene import make_scene
 
@@ -144,7 +144,7 @@ def draw() -> None:
 
 
 def look() -> None:
-    """Let columns of pixels see light change, and learn from events."""
+    """Simulate columns of pixels in changing light, encode events, and update a policy."""
     from envs.config import CameraConfig
     from envs.events.crossings import make_room, named
     from envs.events.emission import Span
@@ -163,7 +163,7 @@ def look() -> None:
 
 
 def act_alone() -> None:
-    """Move through a corridor, and measure the error of its events."""
+    """Step one corridor, and measure its event error."""
     from envs.config import CameraConfig, EnvConfig
     from envs.corridor import CorridorEnv
     from envs.event_error import measure_event_error
@@ -176,7 +176,7 @@ def act_alone() -> None:
 
 
 def act_together() -> None:
-    """Move through corridors side by side, and plan a way."""
+    """Step several corridors as a vector, and plan a path."""
     from envs.config import CameraConfig
     from envs.corridor import CorridorVectorEnv
     from envs.scene.planning import cost_to_go
@@ -189,7 +189,7 @@ def act_together() -> None:
 
 
 def respond() -> None:
-    """Let pixels see whole images change, and write and read their events."""
+    """Simulate the pixels of whole images, and write and read recordings."""
     from envs.config import CameraConfig
     from envs.events import EventCamera
 
@@ -202,7 +202,7 @@ def respond() -> None:
 
 
 def simulate() -> None:
-    """Move through corridors with other sensors, scenes and observations."""
+    """Step corridors with other sensors, scenes and observations."""
     from envs.config import CameraConfig, EnvConfig, FaultsConfig
     from envs.corridor import CorridorEnv
 
@@ -242,7 +242,7 @@ def record() -> None:
 
 
 def encode() -> None:
-    """Encode a few events, as for a policy and as in the training of an encoder."""
+    """Encode a few events, both for a policy and for the training of an encoder."""
     from models.encoder.evae import EventVAE
     from models.encoder.event_batch import batch_packed, batch_windows
     from models.encoder.event_images import last_polarity
@@ -255,7 +255,7 @@ def encode() -> None:
 
 
 def learn() -> None:
-    """Decide by a small policy, and take a gradient step of it."""
+    """Compute the outputs of a small policy, and update it once."""
     import torch
     from torch import nn
 
@@ -282,7 +282,7 @@ def some_events() -> np.ndarray:
     return events
 
 
-FIRST = (draw, look), (act_alone, act_together)  # a compiled step is made of what was drawn and looked by
+FIRST = (draw, look), (act_alone, act_together)  # the kernels of a step include those of `draw` and `look`
 STAGES = {"first": FIRST, "all": (*FIRST, (respond, simulate))}
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
-"""Where the gradients of large networks are computed: `cluster.device`, handed to the processes of a job.
+"""Pass `cluster.device`, on which large networks compute their gradients, to the processes of a job.
 
-It travels in the environment, as the number of threads does, and not in RLlib's settings: Tune continues a
-training only under the settings that it began with, and one that was begun on a GPU may end on a processor.
+It is an environment variable, like the number of threads, and not a setting of RLlib: Tune resumes a training
+only with the settings that it started with, and a training started on a GPU may be resumed on a CPU.
 """
 
 import os
@@ -15,5 +15,5 @@ def device_variables(device: str) -> dict[str, str]:
 
 
 def learner_device() -> str:
-    """Return this process's device, as torch names it."""
+    """Return the device of this process by its name in torch."""
     return os.environ.get(LEARNER_DEVICE, "cpu")

@@ -1,7 +1,7 @@
-"""Files that are written whole or not at all: text, bytes, and JSON that carries its own checksum.
+"""Write text and bytes atomically, and JSON with a checksum.
 
-A power failure, a full disk or an interrupted copy can change a file in a way that still reads as
-JSON, such as in one digit of a result: the checksum tells.
+A power failure, a full disk or an interrupted copy can change one digit of a result, so that the file is
+still valid JSON. The checksum detects this.
 """
 
 import json
@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from core.files import naming
-from core.files import write_atomic as write_atomic  # for the jobs, with the rest of this file
+from core.files import write_atomic as write_atomic  # re-exported for the jobs
 from envs.config import settings_hash
 
-CHECKSUM = "checksum"  # of the other values of a JSON object; files of older versions have none
+CHECKSUM = "checksum"  # covers the other values of a JSON object; older files have none
 
 
 class RunError(RuntimeError):
@@ -21,16 +21,16 @@ class RunError(RuntimeError):
 
 
 def write_json(path: Path, values: object) -> None:
-    """Write plain containers as JSON, whole or not at all; NaN and infinity are refused.
+    """Write plain containers as JSON, atomically; NaN and infinity raise a ValueError.
 
-    An object gets a checksum, which `read_json` compares and takes out.
+    An object gets a checksum, which `read_json` verifies and removes.
     """
     kept = with_checksum(values) if isinstance(values, Mapping) else values
     write_atomic(path, json.dumps(kept, indent=2, allow_nan=False) + "\n")
 
 
 def read_json(path: Path) -> Any:
-    """Read a file of `write_json`.
+    """Read a file that `write_json` wrote.
 
     Raises:
         RunError: The file is damaged.
@@ -43,7 +43,7 @@ def read_json(path: Path) -> Any:
 
 
 def with_checksum(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values of a JSON object as JSON holds them, with their checksum."""
+    """Return the values of a JSON object, converted as JSON stores them, with their checksum."""
     text = json.dumps({name: value for name, value in values.items() if name != CHECKSUM}, allow_nan=False)
     own = json.loads(text)
     return {**own, CHECKSUM: settings_hash(own)}
@@ -53,7 +53,7 @@ def without_checksum(values: Any) -> Any:
     """Return the values of a JSON object without their checksum; values without one are returned unchanged.
 
     Raises:
-        ValueError: They are not those that the checksum was made of.
+        ValueError: The values do not match the checksum.
     """
     if not isinstance(values, dict) or CHECKSUM not in values:
         return values
@@ -63,12 +63,12 @@ def without_checksum(values: Any) -> Any:
 
 
 def json_lines(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return rows as lines of JSON, each with its checksum; NaN and infinity are refused."""
+    """Return rows as lines of JSON, each with its checksum; NaN and infinity raise a ValueError."""
     return "".join(json.dumps(with_checksum(row), allow_nan=False) + "\n" for row in rows)
 
 
 def append_json_lines(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Append `json_lines` to a file, made if it is missing; half a line that a kill left there is removed."""
+    """Append `json_lines` to a file, created if missing; first remove an incomplete last line."""
     with naming(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("ab") as lines:
@@ -77,7 +77,7 @@ def append_json_lines(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def read_json_lines(path: Path) -> list[Any]:
-    """Read the rows of a file of `json_lines`; none without a file. Half a line that a kill left is dropped.
+    """Read the rows of a file of `json_lines`, without an incomplete last line; empty without a file.
 
     Raises:
         RunError: A line is damaged.
@@ -94,6 +94,6 @@ def read_json_lines(path: Path) -> list[Any]:
 
 
 def whole_lines(path: Path) -> bytes:
-    """Return a file's content up to its last line end; nothing without a file."""
+    """Return a file's content up to its last line end; empty without a file."""
     content = path.read_bytes() if path.is_file() else b""
     return content[: content.rfind(b"\n") + 1]

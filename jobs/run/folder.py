@@ -25,48 +25,48 @@ from jobs.run.provenance import provenance
 from jobs.run.undo import keep_what_was_made, undo_if_refused
 from models.kinds import RENAMED, renamed
 
-# What a run folder holds before any result.
+# Files of a run folder before it has any result.
 NEW_FILES = ("config.yaml", "config.json", "tracking.json", ".lock")
-COMPARED_STEPS = 500_000  # length of the trainings that are compared with each other; the paper's
+COMPARED_STEPS = 500_000  # length of the trainings that are compared, as in the paper
 
 Results = TypeVar("Results", bound=Mapping[str, object])
 
 
 @dataclass(frozen=True)
 class Run:
-    """One run folder and the configuration that fills it."""
+    """A run folder and its configuration."""
 
     path: Path
     config: Config
 
     @property
     def data(self) -> Path:
-        """Recordings."""
+        """Return the folder of the recordings."""
         return self.path / "data"
 
     @property
     def encoder(self) -> Path:
-        """Return the frozen encoder, its manifest and checkpoints."""
+        """Return the folder of the frozen encoder, its manifest and checkpoints."""
         return self.path / "encoder"
 
     @property
     def init(self) -> Path:
-        """Return a copy of the policy that the training begins from."""
+        """Return the folder with a copy of the policy from which the training starts."""
         return self.path / "init"
 
     @property
     def train(self) -> Path:
-        """Checkpoints of the policy's training."""
+        """Return the folder of the checkpoints of the policy's training."""
         return self.path / "train"
 
     @property
     def policy(self) -> Path:
-        """Return the trained policy, as `models.policy.load_policy` reads it."""
+        """Return the folder of the trained policy, as `models.policy.load_policy` reads it."""
         return self.path / "policy"
 
     @property
     def evaluation(self) -> Path:
-        """Episodes, tables, plots and videos."""
+        """Return the folder of episodes, tables, plots and videos."""
         return self.path / "eval"
 
 
@@ -96,10 +96,10 @@ def locate_run(config: Config) -> Run:
 
 
 def check_writable(key: str, folder: Path) -> None:
-    """Check that files can be made in a folder, and the folder if it is missing; leave nothing there.
+    """Check that a folder is writable, or can be created if it is missing; leave nothing behind.
 
     Raises:
-        ConfigError: They cannot, with the reason.
+        ConfigError: It is not; the message gives the reason.
     """
     missing = [place for place in (folder, *folder.parents) if not place.exists()]
     try:
@@ -115,20 +115,20 @@ def check_writable(key: str, folder: Path) -> None:
 
 
 def _remove_new(path: Path) -> None:
-    """Remove a run folder that holds its configuration and no results."""
+    """Remove a run folder that has a configuration and no results."""
     for file in [path / name for name in NEW_FILES]:
         file.unlink(missing_ok=True)
     shutil.rmtree(path / ".ray", ignore_errors=True)
-    for place in (path / "train", path, path.parent):  # folders that hold anything else stay
+    for place in (path / "train", path, path.parent):  # folders with other files stay
         with contextlib.suppress(OSError):
             place.rmdir()
 
 
 def reopen(path: Path, config: Config) -> Run:
-    """Return an existing run folder: `TRAINED_BY` from its stored configuration, the rest from `config`.
+    """Return an existing run folder: the sections in `TRAINED_BY` as stored there, the rest from `config`.
 
     Raises:
-        ConfigError: If `path` is no run folder, or was made with a model that has another name now.
+        ConfigError: If `path` is no run folder, or its model has been renamed since.
     """
     stored = path.resolve() / "config.json"
     if not stored.is_file():
@@ -146,18 +146,18 @@ def reopen(path: Path, config: Config) -> Run:
     # Older versions wrote null for the settings that a kind of model does not have.
     values["model"] = {name: value for name, value in values["model"].items() if value is not None}
     run = parse({**as_dict(config), **{name: values.get(name) for name in TRAINED_BY}})
-    return Run(stored.parent, dataclasses.replace(run, tracking=config.tracking))  # with its password
+    return Run(stored.parent, dataclasses.replace(run, tracking=config.tracking))  # not stored: its password
 
 
 def run_name(config: Config) -> str:
-    """Return `<exp>-<budget>-s<seed>-<hash>`; the hash is that of `identity`."""
+    """Return `<exp>-<budget>-s<seed>-<hash>`; the hash covers `identity`."""
     return f"{config.exp}-{config.budget}-s{config.seed}-{settings_hash(identity(config))[:8]}"
 
 
 def group_name(settings: Mapping[str, Any]) -> str:
-    """Return the group that a training of these settings belongs to.
+    """Return the name of the group to which a training with these settings belongs.
 
-    Its experiment, and behind it its length, unless that is `COMPARED_STEPS` or a planner taught it.
+    It is the experiment, followed by the length unless that is `COMPARED_STEPS` or a planner is imitated.
     """
     env_steps, taught = settings["train"]["env_steps"], settings["algo"].get("imitation") is not None
     return str(settings["exp"]) + ("" if taught or env_steps == COMPARED_STEPS else f"_{env_steps // 1000}k")
@@ -182,14 +182,14 @@ def finish(run: Run, stage: str, results: Results) -> Results:
 
 
 def latest_policies(runs_dir: str | Path) -> dict[str, Path]:
-    """Return the policy folder of each kind that was finished last: name of the model -> folder."""
+    """Return the newest policy folder of each kind: name of the model -> folder."""
     manifests = Path(runs_dir).resolve().glob("*/policy/policy.json")
     ordered = sorted(manifests, key=lambda path: path.stat().st_mtime_ns)
     found = {}
     for path in ordered:
         try:
             found[read_json(path).get("name", "")] = path.parent
-        except RunError:  # another run's: its own commands refuse it
+        except RunError:  # of another run, whose own commands report it
             console.print(f"Damaged, not considered: {path}")
     return found
 

@@ -1,4 +1,4 @@
-"""Ends a job whose Ray has lost its head or its node: Ray would leave without saying what to do, or wait."""
+"""End a job if its Ray loses the head or its node. Ray itself would exit without advice, or wait forever."""
 
 import contextlib
 import os
@@ -11,31 +11,31 @@ from types import FrameType
 
 from jobs.run.signals import ENDING, signal_of
 
-# Ray waits 60 s for a head that is gone, and then ends the process in the middle of what it does.
+# Ray waits 60 s for a lost head, and then ends the process without any cleanup.
 SILENCE_S = 40.0
 ASK_EVERY_S = 5.0
-LOOK_EVERY_S = 0.2  # for processes that have ended: Ray ends this one within seconds then
+LOOK_EVERY_S = 0.2  # for ended processes of Ray, after which Ray ends this one within seconds
 ESSENTIAL = ("raylet", "gcs_server")
-LEAVE_S = 10.0  # to close what is open; what waits for Ray may wait forever
+LEAVE_S = 10.0  # for cleanup; calls that wait for Ray may never return
 
 
 class HeadLostError(RuntimeError):
-    """The head of the cluster does not answer; the message says so in one line, and what to do."""
+    """The head of the cluster does not answer; the message says in one line what to do."""
 
 
 @contextlib.contextmanager
 def watching_head(
     ask: Callable[[float], bool] | None = None, ended: Callable[[], str] | None = None
 ) -> Iterator[None]:
-    """Stop the block, which runs in the main thread, if Ray's head is silent for `SILENCE_S`, or Ray ended.
+    """Stop the block, which runs in the main thread, if Ray's head is silent for `SILENCE_S` or Ray ends.
 
     Args:
-        ask: Whether the head answers within so many seconds; None for that of the running Ray.
-        ended: Which of Ray's processes that this one started has ended, "" if none; None for those of
+        ask: Return whether the head answers within the given seconds; None: ask the running Ray.
+        ended: Return which of the processes of Ray that this process started has ended, "" if none; None: ask
             the running Ray.
 
     Raises:
-        HeadLostError: The head was silent so long, or a process of Ray has ended.
+        HeadLostError: The head was silent for `SILENCE_S`, or a process of Ray has ended.
     """
     watch = _Watch(ask or head_answers, ended or ended_process)
     threading.Thread(target=watch.run, name="head-watch", daemon=True).start()
@@ -53,9 +53,9 @@ def watching_head(
 
 @contextlib.contextmanager
 def _heard(lost: threading.Event) -> Iterator[None]:
-    """Let SIGINT interrupt the block once the head is lost, even where it is ignored.
+    """Let SIGINT interrupt the block once the head is lost, even if this process ignores SIGINT.
 
-    A shell that starts a command in the background of a script has it ignore SIGINT; so it stays until then.
+    A command that a script starts in the background ignores SIGINT, and still does until the head is lost.
     """
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
         yield
@@ -73,18 +73,18 @@ def _heard(lost: threading.Event) -> Iterator[None]:
 
 
 def head_answers(seconds: float) -> bool:
-    """Whether the head of the running Ray answers in time; each request is repeated until then."""
+    """Whether the head of the running Ray answers in time; Ray repeats the request until then."""
     from ray._private.worker import global_worker
 
     try:
         global_worker.gcs_client.internal_kv_exists(b"", None, timeout=seconds)
-    except Exception:  # of several types, and a client that is closed has none at all
+    except Exception:  # of several types; after a shutdown there is no client
         return False
     return True
 
 
 def ended_process() -> str:
-    """Return an essential process of Ray that this process has started and that has ended; or ""."""
+    """Return which of the `ESSENTIAL` processes that this process started has ended; "" if none."""
     from ray._private import worker
 
     node = worker._global_node
@@ -111,9 +111,9 @@ class _Watch:
             asked_s = time.monotonic() if due else asked_s
 
     def _lost(self) -> str:
-        """Why the job cannot go on, if it cannot.
+        """Return why the job cannot continue; "" if it can.
 
-        A head is asked at least twice: everything may have been stopped for a while.
+        The head is asked at least twice, because the whole machine may have been suspended for a while.
         """
         began = time.monotonic()
         while time.monotonic() - began < SILENCE_S:

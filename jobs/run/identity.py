@@ -1,4 +1,4 @@
-"""Which settings name a run folder. A folder of any older version keeps its name."""
+"""Select the settings that name a run folder. Folders of older versions keep their names."""
 
 import dataclasses
 from collections.abc import Iterator, Mapping
@@ -17,7 +17,7 @@ TRAINED_BY = (
     *("exp", "budget", "seed", "env", "camera", "faults", "renderer", "fidelity"),
     *("model", "algo", "collect", "pretrain", "train"),
 )
-# The hash has always covered these fields, also at their defaults. Every other field counts only where it
+# The hash has always covered these fields, also at their defaults. Every other field counts only if it
 # differs from its default, so a field that is added to a class renames no folder and needs no row here.
 FIRST = {
     "env": "scene layout control_hz speed_mps action_delay_ms vehicle_radius_m camera_height_m time_limit_s "
@@ -61,7 +61,7 @@ def _later(section: str, cls: type[Any]) -> Iterator[tuple[str, object]]:
             yield field.name, default
 
 
-# Section -> the fields that older run folders lack, each with the value that does what was done before.
+# Section -> the fields that older run folders lack, each with the value that reproduces the old behaviour.
 ADDED_SETTINGS = {name: dict(_later(name, cls)) for name, cls in CLASSES.items()}
 ADDED_SETTINGS["model"] = ADDED_MODEL_SETTINGS
 
@@ -69,8 +69,8 @@ ADDED_SETTINGS["model"] = ADDED_MODEL_SETTINGS
 def identity(config: Config) -> dict[str, Any]:
     """Return the settings whose hash names the run folder.
 
-    Of plug-ins the content counts: another version of a plug-in is another experiment. The settings of a job
-    alone never count, but for those of `ALWAYS`.
+    The content of plug-ins counts: another version of a plug-in is another experiment. A job's own settings
+    do not count, except those in `ALWAYS`.
     """
     values = as_dict(config)
     settings: dict[str, Any] = {name: values[name] for name in TRAINED_BY}
@@ -89,7 +89,7 @@ def identity(config: Config) -> dict[str, Any]:
 
 
 def _of_older_versions(usual: Mapping[str, object], given: object) -> dict[str, object]:
-    """Return the values that the older fields have; newer fields count where they are not null."""
+    """Return the values of the older fields, and of newer fields that are not null."""
     if not isinstance(given, Mapping):
         return dict(usual)
     return {**usual, **{name: value for name, value in given.items() if name in usual or value is not None}}

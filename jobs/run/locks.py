@@ -1,4 +1,4 @@
-"""Locks between processes: one holds a file at a time; a process that ends, even killed, lets go of it."""
+"""Locks between processes. A lock is released when its process ends, even if it is killed."""
 
 import contextlib
 import os
@@ -16,7 +16,7 @@ from jobs.run.progress import console
 
 @contextlib.contextmanager
 def locked(file: Path, waiting: str = "") -> Iterator[None]:
-    """Hold a lock file, which is made if it is missing; while another process holds it, say so and wait."""
+    """Hold a lock file, created if missing; while another process holds it, print `waiting` and wait."""
     file.parent.mkdir(parents=True, exist_ok=True)
     try:
         lock = FileLock(file).acquire(blocking=False)
@@ -30,7 +30,7 @@ def locked(file: Path, waiting: str = "") -> Iterator[None]:
 
 @contextlib.contextmanager
 def held_alone(folder: Path) -> Iterator[None]:
-    """Work in a folder as the only process: two would do everything twice, and mix their results.
+    """Lock a folder for this process: two processes would do the work twice and mix their results.
 
     Raises:
         RunError: Another process holds the folder; the message names it.
@@ -52,13 +52,13 @@ def private_folder(place: str | None = None) -> Path:
     """Return a temporary folder that no other user can read or fill with links; create it if it is missing.
 
     Args:
-        place: The folder that it lies in; the system's temporary folder if None.
+        place: Its parent folder; None: the system's temporary folder.
 
     Raises:
         RunError: The folder belongs to someone else, or others may enter it.
     """
     folder = Path(place or tempfile.gettempdir(), f"evade-{os.getuid()}")
-    with contextlib.suppress(FileExistsError):  # whatever it is: a folder, or another user's link
+    with contextlib.suppress(FileExistsError):  # it may be a link of another user: checked below
         folder.mkdir(mode=0o700)
     info = folder.lstat()
     if not stat.S_ISDIR(info.st_mode) or info.st_uid != os.getuid() or info.st_mode & 0o077:

@@ -1,4 +1,4 @@
-"""Progress that a person can read: a bar in a terminal, a plain line now and then elsewhere."""
+"""Show progress: a bar in a terminal, elsewhere a plain line every few seconds."""
 
 import contextlib
 import sys
@@ -10,23 +10,23 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 PLAIN_LINE_EVERY_S = 10.0
 
-# Text is shown as it stands: what a file or a person has named may have brackets.
+# Without markup, because names of files and names that users choose may contain brackets.
 console = Console(markup=False, highlight=False, soft_wrap=True, width=None if sys.stdout.isatty() else 140)
 
 
 @contextlib.contextmanager
 def progress(title: str, total: int, unit: str, done: int = 0) -> Iterator[Callable[..., None]]:
-    """Show how far a job is, its speed, and the time that is left.
+    """Show a job's progress, speed and remaining time.
 
     Args:
         title: What is being done.
-        total: How many units there are in all.
-        unit: What is counted, in the plural.
-        done: How many were done by an earlier run that this one continues.
+        total: Number of units.
+        unit: Name of the units, in the plural.
+        done: Number of units done by an earlier run that this one continues.
 
     Yields:
         `advance(count, note="")`: report that `count` more units are done; the note (such as
-        the current loss) is shown behind them.
+        the current loss) is shown after them.
     """
     if console.is_terminal:
         columns = (
@@ -59,12 +59,12 @@ class _PlainLines:
         self.title, self.total, self.unit = title, total, unit
         self.done = done
         self.started = self.shown = time.monotonic()
-        self.counted: tuple[float, int] | None = None  # when, and at how many, the first units were reported
+        self.counted: tuple[float, int] | None = None  # time and count of the first report
         self.note = ""
 
     def advance(self, count: int, note: str = "") -> None:
         self.done += count
-        # The speed leaves out what comes before the first units, as the start of a cluster.
+        # The speed excludes the time before the first report, such as the start of a cluster.
         self.counted = self.counted or (time.monotonic(), self.done)
         self.note = note or self.note
         if time.monotonic() - self.shown >= PLAIN_LINE_EVERY_S and self.done < self.total:

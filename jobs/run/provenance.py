@@ -1,4 +1,4 @@
-"""The provenance of a number: the commit, the machine, the command and the date."""
+"""Return the provenance of a result: commit, machine, command and date."""
 
 import os
 import re
@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import TypedDict
 
 REPOSITORY = Path(__file__).resolve().parents[2]
-PLACES = ("runs_dir=", "resume=", "tracking.", "cluster")  # words that say where, not what
+PLACES = ("runs_dir=", "resume=", "tracking.", "cluster")  # words that say where a command runs and writes
 
 
 class Provenance(TypedDict):
-    """Where a number comes from: the commit and the machine."""
+    """The commit and the machine that produced a result."""
 
     commit: str
     host: str
@@ -29,7 +29,7 @@ def provenance() -> Provenance:
 
 
 def git_commit() -> str:
-    """Return the repository's commit, with "-dirty" behind it if files differ from it; or "unknown"."""
+    """Return the commit, with "-dirty" appended if tracked files differ from it; "unknown" without git."""
     commit = _git("rev-parse", "HEAD")
     if commit is None:
         return "unknown"
@@ -49,9 +49,9 @@ def _git(*arguments: str) -> str | None:
 
 
 def command() -> str:
-    """Return the command that is running, without local paths and without where it runs and writes."""
+    """Return the running command, without local paths and without the words in `PLACES`."""
     words = [
-        re.sub(r"(?<![\w/.-])(?:\.\.)?/[^\s,\]]*/", "", word)  # what stands within the repository stays
+        re.sub(r"(?<![\w/.-])(?:\.\.)?/[^\s,\]]*/", "", word)  # paths inside the repository remain
         for word in sys.argv[1:]
         if not word.lstrip("+").startswith(PLACES)
     ]

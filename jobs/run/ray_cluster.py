@@ -1,4 +1,4 @@
-"""Start or join Ray: quietly, authenticated, one thread per worker; a local one on loopback alone."""
+"""Start or join Ray: quiet, authenticated, one thread per worker; a local Ray listens on loopback only."""
 
 import contextlib
 import logging
@@ -27,23 +27,23 @@ QUIET = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
     "RAY_DEDUP_LOGS": "1",
-    # Ray's own 15 leaves a worker a thirtieth of a core that any other program wants.
+    # At Ray's default of 15, a worker gets a thirtieth of a core that another program uses, too.
     "RAY_worker_niceness": "0",
-    # A busy machine starts a worker in minutes; after a minute, Ray would start a second one.
+    # On a busy machine a worker takes minutes to start; after one minute, Ray would start a second one.
     "RAY_worker_register_timeout_seconds": "600",
     "RAY_AIR_NEW_OUTPUT": "0",
-    # Write down at once which checkpoint is the newest: a kill must not leave the name of one
+    # Record at once which checkpoint is the newest: after a kill, the record must not name one
     # that newer ones have replaced.
     "TUNE_GLOBAL_CHECKPOINT_S": "0",
     "TUNE_DISABLE_AUTO_CALLBACK_LOGGERS": "1",
-    # Tune would take Ctrl+C for the end of a training.
+    # Tune would treat Ctrl+C as the end of a training.
     "TUNE_DISABLE_SIGINT_HANDLER": "1",
     "TUNE_WARN_EXCESSIVE_EXPERIMENT_CHECKPOINT_SYNC_THRESHOLD_S": "0",
 }
-# Of a path [bytes]: a socket's has room for 107 (103 on macOS), and Ray appends
+# Longest path [bytes]: the path of a socket has at most 107 (103 on macOS), and Ray appends
 # "/ray/session_2026-01-31_23-59-59_123456_4194304/sockets/plasma_store".
 MAX_RAY_FOLDER = 35
-MAX_STARTS = 5  # of a local Ray, which gives itself 30 s: too little on a busy machine
+MAX_STARTS = 5  # of a local Ray, which times out after 30 s: too short on a busy machine
 
 
 class ClusterError(RuntimeError):
@@ -53,19 +53,19 @@ class ClusterError(RuntimeError):
 def start_ray(cluster: ClusterConfig, folder: Path) -> None:
     """Start Ray on this machine, or join the configured cluster; do nothing if Ray is running already.
 
-    A local Ray listens on the loopback address alone, keeps its sockets and logs in a private folder,
-    and asks every client for a token, which lies in a file that its owner alone can read; the home
-    folder is not touched. Workers run one thread each, see `jobs.run.libraries`.
+    A local Ray listens on the loopback address only, and keeps its sockets and logs in a private folder.
+    It asks every client for a token, which is in a file that only its owner can read. The home folder is
+    not used. Workers run one thread each, see `jobs.run.libraries`.
 
     Args:
         cluster: Where Ray runs.
-        folder: Where the token of a local Ray is kept.
+        folder: Folder for the token of a local Ray.
 
     Raises:
-        ConfigError: If the cluster cannot be joined, one of its machines has other code than this
-            one, others can read the token, or RAY_AUTH_MODE does not say whether the cluster asks
-            for one.
-        ClusterError: If this machine is too busy to start one.
+        ConfigError: If the cluster cannot be joined, one of its machines has different code than this
+            one, others can read the token, or RAY_AUTH_MODE does not say whether the cluster requires
+            a token.
+        ClusterError: If this machine is too busy to start a Ray.
     """
     os.environ.update({name: value for name, value in QUIET.items() if name not in os.environ})
     check_mode(cluster)
@@ -91,8 +91,8 @@ def start_ray(cluster: ClusterConfig, folder: Path) -> None:
     }
     with keeping_handlers():
         if cluster.name == "local":
-            os.environ["RAY_TMPDIR"] = str(ray_folder())  # of its workers, too
-            # Two processes that started Ray within seconds of each other have waited for each other forever.
+            os.environ["RAY_TMPDIR"] = str(ray_folder())  # its workers inherit it
+            # Two processes that started Ray within seconds of each other have deadlocked.
             with locked(ray_folder() / "start-ray.lock"):
                 forget_sessions(ray_folder())
                 _start_local({"num_cpus": cluster.num_cpus, **settings})
@@ -102,14 +102,14 @@ def start_ray(cluster: ClusterConfig, folder: Path) -> None:
 
 
 class _Path(list[str]):
-    """Folders that Ray cannot add to."""
+    """A list of folders that Ray cannot extend."""
 
     def extend(self, folders: Iterable[str]) -> None:
-        """Leave out the current folder: its own `envs`, `models` or `jobs` would come before ours."""
+        """Ignore the current folder: its `envs`, `models` or `jobs` would hide ours."""
 
 
 def _job_config() -> Any:
-    """Return Ray's settings of a job whose workers import this repository's packages from any folder."""
+    """Return Ray's job settings: workers import this repository's packages, whatever the current folder."""
     from ray.job_config import JobConfig
 
     return JobConfig(_py_driver_sys_path=_Path([str(REPOSITORY)]))
@@ -125,7 +125,7 @@ def _join(address: str, settings: Mapping[str, object]) -> None:
 
 
 def why_not_joined(error: Exception) -> str:
-    """Why Ray could not join a cluster, in one line, with the remedy where it is known."""
+    """Return in one line why Ray could not join a cluster, with the remedy if it is known."""
     text = f"{error}\n{error.__cause__ or ''}"
     if "InvalidAuthToken" in text or "AuthenticationError" in text:
         return (
@@ -146,7 +146,7 @@ def _start_local(settings: Mapping[str, object]) -> None:
             with on_loopback():
                 ray.init(address="local", include_dashboard=False, **settings)
             return
-        except Exception as error:  # Ray's own has no type of its own
+        except Exception as error:  # Ray raises no specific type
             if "timed out during startup" not in str(error):
                 raise
             ray.shutdown()
@@ -157,10 +157,10 @@ def _start_local(settings: Mapping[str, object]) -> None:
 
 @contextlib.contextmanager
 def on_loopback() -> Iterator[None]:
-    """Let a Ray that starts take the loopback address for this machine's, and listen nowhere else.
+    """Let a Ray that starts in the block listen on the loopback address only.
 
-    That is what RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER=0 does; but Ray reads the variable when it is
-    imported, which may have been before. `_node_ip_address="127.0.0.1"` has no effect: Ray replaces it.
+    RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER=0 would do the same, but Ray reads the variable at its import, which
+    may be over. `_node_ip_address="127.0.0.1"` has no effect: Ray replaces it.
     """
     from ray._private import ray_constants
 
@@ -175,8 +175,8 @@ def on_loopback() -> Iterator[None]:
 def ray_folder() -> Path:
     """Return the folder of a local Ray's sockets, logs, locks and staged files, private to this user.
 
-    Tune copies the state of an experiment through it and unpickles what it finds there. It lies in
-    /tmp where the path of the temporary folder is too long for a socket.
+    Tune stages the state of an experiment there and unpickles what it finds. The folder is in /tmp if
+    the path of the temporary folder is too long for a socket.
 
     Raises:
         RunError: The folder belongs to someone else, or others may enter it.
@@ -184,25 +184,25 @@ def ray_folder() -> Path:
     folder = private_folder()
     if len(os.fsencode(folder)) <= MAX_RAY_FOLDER:
         return folder
-    return private_folder("/tmp")  # noqa: S108  entered by its owner alone
+    return private_folder("/tmp")  # noqa: S108  only its owner can enter it
 
 
 def logs_folder() -> Path:
-    """Return the logs of the running Ray."""
+    """Return the folder of the running Ray's logs."""
     from ray._private import worker
 
     return Path(worker._global_node.get_logs_dir_path())
 
 
 def session_folder() -> Path | None:
-    """Return a folder of the running Ray, which goes when its logs do; None without Ray."""
+    """Return the session folder of the running Ray, deleted together with its logs; None without Ray."""
     from ray._private import worker
 
     return None if worker._global_node is None else Path(worker._global_node.get_session_dir_path())
 
 
 def fit(tuner: Any) -> Any:
-    """Run a Tuner; raise an error of its callbacks itself, not the text of its traceback.
+    """Run a Tuner; if a callback fails, raise its error instead of Tune's error with the traceback as text.
 
     Raises:
         HeadLostError: The head of the cluster does not answer any more.
@@ -217,7 +217,7 @@ def fit(tuner: Any) -> Any:
 
 
 def storage(cluster: ClusterConfig, folder: Path) -> str:
-    """Return where the nodes of a cluster store the files of a run's folder: a path or an address.
+    """Return the path or address at which the nodes of a cluster store a folder of a run.
 
     Args:
         cluster: Names the storage, if it is not the run folder itself.
@@ -229,7 +229,7 @@ def storage(cluster: ClusterConfig, folder: Path) -> str:
 
 
 def holds(place: str, start: str) -> bool:
-    """Whether a path or an address holds a file whose name begins with `start`."""
+    """Whether a path or an address contains a file whose name starts with `start`."""
     import pyarrow.fs
 
     system, root = pyarrow.fs.FileSystem.from_uri(place)
@@ -238,7 +238,7 @@ def holds(place: str, start: str) -> bool:
 
 
 def check_mode(cluster: ClusterConfig) -> None:
-    """Reject a Ray without authentication, unless the user says that a cluster has none.
+    """Reject a Ray without authentication, unless the user states that the cluster has none.
 
     Raises:
         ConfigError: RAY_AUTH_MODE turns a local Ray's token off, or is not given for another.
@@ -256,11 +256,10 @@ def check_mode(cluster: ClusterConfig) -> None:
 
 
 def use_token(file: Path) -> None:
-    """Let this process's Ray authenticate by the token in a private file, made if missing.
+    """Let this process's Ray authenticate by the token in a private file, created if missing.
 
-    A token that the environment already names is kept. RAY_AUTH_MODE stays as it is: a Ray
-    that starts without it turns authentication on, whereas a Ray that is already imported
-    would not notice it.
+    If the environment names a token, that token is used. RAY_AUTH_MODE is not changed: a Ray that
+    starts without it turns authentication on, and a Ray that is already imported would ignore it.
 
     Raises:
         ConfigError: If the file is another user's, or others can read it.
@@ -274,18 +273,18 @@ def use_token(file: Path) -> None:
 
 
 def make_token(file: Path) -> None:
-    """Write a new token to a file that nobody else can read; one that is there stays."""
-    if file.is_file() and not file.stat().st_size:  # a power failure cut it
+    """Write a new token to a file that nobody else can read, unless the file exists."""
+    if file.is_file() and not file.stat().st_size:  # truncated by a power failure
         file.unlink()
     if file.exists():
         return
     file.parent.mkdir(parents=True, exist_ok=True)
     file.parent.chmod(0o700)
-    handle, part = tempfile.mkstemp(dir=file.parent)  # for its owner alone
+    handle, part = tempfile.mkstemp(dir=file.parent)  # only its owner can read it
     with os.fdopen(handle, "w") as stream:
         stream.write(secrets.token_hex(32))
     with contextlib.suppress(FileExistsError):
-        os.link(part, file)  # whole or not at all, and never over one that another process made
+        os.link(part, file)  # atomic, and never replaces the token of another process
     Path(part).unlink()
 
 

@@ -1,18 +1,18 @@
-"""Folders of local Rays that have ended: the newest stay for their logs, older ones are deleted."""
+"""Delete the folders of local Rays that have ended, except the newest, which are left for their logs."""
 
 import shutil
 import socket
 from pathlib import Path
 
-KEPT = 10  # of those that have ended; a few MB each
+KEPT = 10  # newest ended sessions; a few MB each
 
 
 def forget_sessions(folder: Path) -> None:
-    """Delete the folders of all but the newest `KEPT` sessions that have ended, and the sockets of these.
+    """Delete the folders of ended sessions; of the newest `KEPT` sessions delete only the sockets.
 
     Args:
-        folder: Where a local Ray keeps its sessions, see `jobs.run.ray_cluster.ray_folder`; no Ray may
-            be starting in it.
+        folder: Folder of the local Rays' sessions, see `jobs.run.ray_cluster.ray_folder`; no Ray may be
+            starting in it.
     """
     sessions = [path for path in folder.glob("ray/session_*") if path.is_dir() and not path.is_symlink()]
     ended = sorted((path for path in sessions if not serves(path)), reverse=True)  # names begin with the time
@@ -23,7 +23,7 @@ def forget_sessions(folder: Path) -> None:
 
 
 def serves(session: Path) -> bool:
-    """Whether the Ray of a session still runs: its store takes connections, also of other containers."""
+    """Whether the Ray of a session still runs: its store accepts connections, also across containers."""
     with socket.socket(socket.AF_UNIX) as client:
         client.settimeout(1.0)
         try:
@@ -31,5 +31,5 @@ def serves(session: Path) -> bool:
         except (ConnectionRefusedError, FileNotFoundError):
             return False
         except OSError:
-            return True  # it does not answer now
+            return True  # it runs, but does not answer now
     return True

@@ -1,4 +1,4 @@
-"""Read event files as every command does: by the keys `recording.*`, and print what the reader tells."""
+"""Read event files by the keys `recording.*`, as every command does, and print the reader's warnings."""
 
 import contextlib
 import dataclasses
@@ -23,7 +23,7 @@ EXAMPLES = {"columns": "[t,x,y,p]", "time_unit": "us", "strict": "true", "stream
 
 
 def read_recording(path: str | Path, settings: RecordingConfig) -> EventFile:
-    """Return the events of a file, and print what was left out, chosen or missing.
+    """Return the events of a file, and print the reader's warnings: what it left out, chose or missed.
 
     Raises:
         ValueError: As `envs.recordings.read_events`.
@@ -33,10 +33,10 @@ def read_recording(path: str | Path, settings: RecordingConfig) -> EventFile:
 
 
 def recording_parts(path: str | Path, settings: RecordingConfig) -> Iterator[EventFile]:
-    """Yield the events of a file in parts, with a line now and then about how far it is.
+    """Yield the events of a file in parts, and print the progress every `TELL_EVERY_S`.
 
     Raises:
-        ValueError: As `envs.recordings.read_parts`.
+        ValueError: As `envs.recordings.read_parts`, or for more than `max_events` events.
     """
     count, told = 0, math.inf  # the first part may have to compile its reader
     given = options(path, settings)
@@ -61,7 +61,7 @@ def recording_parts(path: str | Path, settings: RecordingConfig) -> Iterator[Eve
 
 
 def options(path: str | Path, settings: RecordingConfig) -> dict[str, Any]:
-    """Return the arguments of `read_events`; bare rows of the Event Camera Dataset need none."""
+    """Return the arguments of `read_events`; for bare rows of the Event Camera Dataset, fill them in."""
     given = {name: getattr(settings, name) for name in KEYS}
     if given["columns"] is None and given["format"] in (None, "txt") and Path(path).is_file():
         with Path(path).open("rb") as file:
@@ -73,10 +73,10 @@ def options(path: str | Path, settings: RecordingConfig) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def refusing(key: str, path: str | Path) -> Iterator[None]:
-    """Read a file for a command in a block.
+    """Convert the errors of a block that reads a file for a command.
 
     Raises:
-        ConfigError: The file is refused, as `refused` says.
+        ConfigError: The file cannot be read; the error is that of `refused`.
     """
     try:
         yield
@@ -85,7 +85,7 @@ def refusing(key: str, path: str | Path) -> Iterator[None]:
 
 
 def refused(key: str, path: str | Path, error: Exception) -> ConfigError:
-    """Return the error of a command for a file that is refused, with the keys that its remedy names."""
+    """Return a command's error for a file that it cannot read, with the keys that its remedy names."""
     if not str(error).startswith(str(path)):
         error = ValueError(f"{path}: {error}")
     named = [name for name in KEYS if re.search(rf"\b{name}\b", str(error).partition(": ")[2])]
@@ -95,7 +95,7 @@ def refused(key: str, path: str | Path, error: Exception) -> ConfigError:
 
 @contextlib.contextmanager
 def _printing() -> Iterator[None]:
-    """Print the warnings of a block as plain lines, with the keys of commands."""
+    """Print the warnings of a block as plain lines, with keys of the command line for names of arguments."""
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always", UserWarning)
         yield

@@ -1,4 +1,4 @@
-"""Settings of a command line that a continued run does not take, because its own are stored in its folder."""
+"""Reject settings of a command line that a resumed run would ignore, because its folder stores its own."""
 
 from collections.abc import Collection
 from pathlib import Path
@@ -8,7 +8,7 @@ from jobs.config.flat import flat
 from jobs.run.folder import reopen
 from jobs.run.identity import TRAINED_BY
 
-# Its `resume` names a study to publish, and its settings are compared with the study's.
+# For this job, `resume` names a study to publish; the settings are compared with the study's.
 READS_STUDIES = "report"
 
 
@@ -20,7 +20,7 @@ def check_resumed(config: Config, given: Collection[str]) -> None:
         given: The keys that the command line gives, such as "algo.lr", or a whole section, such as "algo".
 
     Raises:
-        ConfigError: With a line for each key whose stored value is another one; or as `reopen`.
+        ConfigError: With a line for each key whose stored value differs; or as `reopen`.
     """
     if config.resume is None or config.job == READS_STUDIES:
         return

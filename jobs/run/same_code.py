@@ -9,12 +9,12 @@ from jobs.config.plugins import digest_of, plugin_digests
 from jobs.run.provenance import REPOSITORY
 
 ROOMS = ("core", "envs", "models", "jobs")
-PACKAGES = ("numba", "numpy", "torch")  # decide the digits; Ray compares itself and Python
-ANSWER_S = 600.0  # a busy machine starts a worker in minutes
+PACKAGES = ("numba", "numpy", "torch")  # they affect results; Ray compares its own and Python's version
+ANSWER_S = 600.0  # on a busy machine a worker takes minutes to start
 
 
 def fingerprint() -> dict[str, str]:
-    """Return what decides this process's results: the code, as a SHA-256, and the packages' versions."""
+    """Return what this process's results depend on: SHA-256 of the code and plug-ins, package versions."""
     files = [file for room in ROOMS for file in sorted((REPOSITORY / room).rglob("*.py"))]
     versions = {name: version(name) for name in PACKAGES}
     return {"evade": digest_of(files, REPOSITORY), **versions, **plugin_digests()}
@@ -23,10 +23,10 @@ def fingerprint() -> dict[str, str]:
 def check_machines() -> None:
     """Check that each machine of the joined cluster that computes has the same code as this machine.
 
-    A machine that joins later is not asked, and one that is lost meanwhile is left out.
+    Machines that join later are not checked; machines that are lost during the check are ignored.
 
     Raises:
-        ConfigError: One has another version, or none.
+        ConfigError: A machine has other versions, or none.
     """
     here = fingerprint()
     errors = differences(here, ask_machines())

@@ -1,4 +1,4 @@
-"""Signals that end a job as Ctrl+C does: with one message, its runs marked as killed, and Ray stopped."""
+"""Let SIGTERM and SIGHUP end a job as Ctrl+C does: one message, runs marked as killed, Ray stopped."""
 
 import contextlib
 import signal
@@ -6,11 +6,11 @@ import threading
 from collections.abc import Iterator
 from types import FrameType
 
-# docker stop, Slurm and Kubernetes send SIGTERM, a terminal that closes SIGHUP.
+# docker stop, Slurm and Kubernetes send SIGTERM, a closing terminal sends SIGHUP.
 ENDING = (signal.SIGTERM, signal.SIGHUP)
 
 
-_received: list[int] = []  # of ENDING, since `end_on_signals`
+_received: list[int] = []  # signals of `ENDING`, since `end_on_signals`
 
 
 class Ended(KeyboardInterrupt):

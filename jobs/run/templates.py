@@ -1,4 +1,4 @@
-"""Text from jinja2 templates, which lie in the folders of the modules that fill them."""
+"""Fill jinja2 templates, which are in the folders of the modules that use them."""
 
 from pathlib import Path
 
@@ -6,11 +6,11 @@ import jinja2
 
 
 def render(template: Path, **values: object) -> str:
-    """Fill a template; a name in it that is not given raises.
+    """Fill a template; raise jinja2.UndefinedError if it uses a name without a value.
 
     Args:
-        template: File of Markdown with jinja2's marks.
-        **values: What the template names.
+        template: Markdown file with jinja2 markup.
+        **values: Values of the names in the template.
     """
     environment = jinja2.Environment(  # noqa: S701 - Markdown, not HTML
         undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True

@@ -10,8 +10,8 @@ import torch
 def torch_threads(count: int) -> Iterator[None]:
     """Set torch's number of threads to `count` for a block, and restore it afterwards.
 
-    Sums are added in another order by other numbers of threads: what one part of a job took must not
-    change the digits of the next.
+    The number of threads changes the order of sums and so their rounding: the number that one part of a job
+    uses must not change the results of the next part.
     """
     before = torch.get_num_threads()
     torch.set_num_threads(count)

@@ -1,25 +1,25 @@
-"""Copies of Tune's state of a training: Tune overwrites its own file, and a full disk cuts it short."""
+"""Back up Tune's state of a training: Tune overwrites its file in place, and a full disk truncates it."""
 
 import json
 from pathlib import Path
 
 from jobs.run.files import write_atomic
 
-STATES = "experiment_state-*.json"  # Tune's, one of each command; the newest counts
-KEPT = "kept_state.json"  # does not match, so that Tune does not read it
+STATES = "experiment_state-*.json"  # files of Tune, one per command; it reads the newest
+KEPT = "kept_state.json"  # does not match `STATES`, so Tune ignores it
 
 
 def keep_state(experiment: Path) -> None:
-    """Copy the newest state of an experiment, if it is whole, into a file that is written atomically."""
+    """Copy the newest state of an experiment, if it is intact, to a file that is written atomically."""
     states = sorted(experiment.glob(STATES))
     if states and _is_whole(states[-1]):
         write_atomic(experiment / KEPT, states[-1].read_bytes())
 
 
 def mend_state(experiment: Path) -> str | None:
-    """Replace truncated states by the copy; return what was done, None if nothing.
+    """Replace truncated states by the copy; return a message, None if nothing was done.
 
-    Without a copy, the training starts again, with the same results.
+    Without a copy, the training continues from an older state or starts again, with the same results.
     """
     damaged = [path for path in sorted(experiment.glob(STATES)) if not _is_whole(path)]
     if not damaged:

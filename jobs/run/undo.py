@@ -1,4 +1,4 @@
-"""Remove what a command has made before it is refused, so that a refusal leaves nothing behind."""
+"""Remove what a command has created before its settings were rejected, so that nothing is left behind."""
 
 import contextlib
 from collections.abc import Callable
@@ -7,17 +7,17 @@ _made: list[Callable[[], object]] = []
 
 
 def undo_if_refused(remove: Callable[[], object]) -> None:
-    """Remember how to remove something that was just made and holds no result yet."""
+    """Register a function that removes something just created that holds no result yet."""
     _made.append(remove)
 
 
 def keep_what_was_made() -> None:
-    """Forget all of it, because there are results now."""
+    """Forget all registered functions, because there are results now."""
     _made.clear()
 
 
 def undo() -> None:
-    """Remove what was made, the newest first. What cannot be removed stays."""
+    """Call the registered functions, the newest first; ignore their errors."""
     while _made:
         with contextlib.suppress(Exception):
             _made.pop()()

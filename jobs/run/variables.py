@@ -1,4 +1,4 @@
-"""Set variables of the environment for a block."""
+"""Set environment variables for a block."""
 
 import contextlib
 import os
@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 
 @contextlib.contextmanager
 def variables_set(values: Mapping[str, str]) -> Iterator[None]:
-    """Set variables of the environment for a block, and restore them afterwards."""
+    """Set environment variables for a block, and restore them afterwards."""
     before = {name: os.environ.get(name) for name in values}
     os.environ.update(values)
     try:

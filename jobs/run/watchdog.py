@@ -1,4 +1,4 @@
-"""A time limit for work that may hang: the process is ended, so that another can try again."""
+"""Limit the time of work that may hang: end the process, so that another process can retry."""
 
 import contextlib
 import faulthandler
@@ -9,8 +9,8 @@ from collections.abc import Iterator
 def ending_after(seconds: float) -> Iterator[None]:
     """End this process, with a traceback in its log, if the block takes longer.
 
-    A kernel that hangs holds the interpreter, so that no exception reaches it: the thread that watches
-    is not one of Python's. One block at a time; blocks cannot be nested.
+    A kernel that hangs holds the interpreter's lock, so no exception can reach it; the watching thread is
+    therefore not a Python thread. Blocks cannot be nested.
     """
     faulthandler.dump_traceback_later(seconds, exit=True)
     try:

@@ -13,16 +13,16 @@ from jobs.study.results import Value
 from jobs.study.summaries import Summary
 from jobs.study.words import TITLES
 
-WIDTH = 0.7  # of all groups at one value, where values are a step of 1 apart
+WIDTH = 0.7  # of the markers of all groups at one value; values are 1 apart
 
 
 def axis_figure(axis: str, points: Mapping[Value, Mapping[str, object]], found: Sequence[Summary]) -> Figure:
-    """Draw a marker with its interval for each group and value, joined by lines over numbers.
+    """Draw a marker with interval for each group and value; lines join them if the axis is numeric.
 
     Args:
-        axis: Its name.
-        points: Value -> settings that it changes; the first one names it.
-        found: Of this axis.
+        axis: Name of the axis.
+        points: Value -> changed settings; the first setting labels the axis.
+        found: Summaries along this axis.
     """
     by_text = {text_of(value): changes for value, changes in points.items()}
     moving, numbers = moving_settings(by_text), axis_numbers(by_text) is not None
@@ -55,14 +55,14 @@ def axis_figure(axis: str, points: Mapping[Value, Mapping[str, object]], found: 
 
 
 def _tick(point: Mapping[str, object], moving: Sequence[str]) -> str:
-    """Return what a point is; where several settings change, each on a line of its own with its name."""
+    """Return the label of a point; if several settings vary, one line for each with its name."""
     if len(moving) < 2:
         return text_of(next(iter(point.values()))).replace("_", "\n")
     return "\n".join(f"{key.rpartition('.')[2]} {text_of(point[key])}" for key in moving)
 
 
 def _footnote(axis: str, points: Mapping[Value, Mapping[str, object]], moving: Sequence[str]) -> str:
-    """Return what stays the same along the axis."""
+    """Return the footnote: the axis, the settings that are constant along it, and the kind of interval."""
     point = next(iter(points.values()))
     held = [f"{key.rpartition('.')[2]} {value}" for key, value in point.items() if key not in moving]
     return "; ".join([axis, *held, "95 % intervals over trainings"])

@@ -1,8 +1,9 @@
-"""What each condition changes for each group, against its baseline, in the same corridors.
+"""Compare each condition with its baseline for each group, in the same corridors.
 
-Two questions have two families of tests. Would another training of the same kind lose? (`Change.certain`,
-over trainings; few trainings cannot tell.) Does this published training lose? (`Change.broken`, over its
-corridors, by McNemar's exact test.) Both are corrected by Benjamini and Hochberg (1995).
+There are two questions, each with its own family of tests. Would another training of the same kind lose
+success? (`Change.certain`, over trainings; undecidable with few.) Does this published training lose success?
+(`Change.broken`, over its corridors, by McNemar's exact test.) Both families are corrected by Benjamini and
+Hochberg (1995).
 """
 
 from collections.abc import Iterator, Sequence
@@ -16,17 +17,18 @@ from jobs.study.results import Condition, Results, Trainings, values_of
 
 
 class Change(NamedTuple):
-    """What a condition changes for a group.
+    """Change of a group's success under a condition.
 
     Attributes:
         condition: The condition.
         baseline: The condition it is compared with.
-        group: What was trained.
-        success: Rate under the condition, of each training (n,).
-        before: Rate at the baseline (n,).
-        difference: Of the rates, of the same trainings in the same corridors; of one training over corridors.
+        group: The group, with n trainings.
+        success: Success rate of each training under the condition, (n,).
+        before: Success rate of each training at the baseline, (n,).
+        difference: Difference of the rates, paired by training and corridor, with an interval over trainings;
+            over corridors if there is a single training.
         certain: Whether the group's change is certain in its family; never for a single training.
-        broken: bool (n,), whether a training certainly loses, in the family of all trainings' tests.
+        broken: bool (n,), whether each training certainly loses, in the family of all trainings' tests.
     """
 
     condition: Condition
@@ -40,17 +42,17 @@ class Change(NamedTuple):
 
     @property
     def loses(self) -> bool:
-        """Whether the mean of the trainings falls."""
+        """Whether mean success falls."""
         return self.difference.value < 0
 
 
 def changes_of(results: Results, every: bool = False) -> list[Change]:
-    """Compare each condition with its baseline for each trained group, no simulation twice.
+    """Compare each condition with its baseline for each trained group, without repeating a simulation.
 
     Args:
-        results: What was evaluated.
-        every: Keep also what is the same simulation for a group alone, as event noise is for a policy that
-            sees no events: a plan that was written before names all of its conditions.
+        results: The episodes.
+        every: Include equal and repeated simulations, such as event noise for a policy that sees no events.
+            For studies whose plan names all of its conditions in advance.
     """
     found = [
         _change(at, baseline, group, results.cells[at, group], results.cells[baseline, group])
@@ -71,16 +73,17 @@ def changes_of(results: Results, every: bool = False) -> list[Change]:
 
 
 def replicated(changes: Sequence[Change]) -> list[Change]:
-    """Return the changes of groups with several trainings, from which something follows for others."""
+    """Return the changes of groups with several trainings, which allow conclusions about other trainings."""
     return [change for change in changes if len(change.success) > 1]
 
 
 def compared_pairs(results: Results, group: str | None = None) -> list[tuple[Condition, Condition]]:
-    """Return condition and baseline of each change; of those that are the same at both ends the first.
+    """Return condition and baseline of each change, without pairs that repeat the same two simulations.
 
     Args:
-        results: What was evaluated.
-        group: Whose: one that was trained at another rate may have other baselines. None: those of most.
+        results: The results of the study.
+        group: The group; its baselines may differ if it was trained at another rate. None: the baselines of
+            most groups.
     """
     same = results.same_as
     found: dict[tuple[Condition, Condition], tuple[Condition, Condition]] = {}
@@ -92,12 +95,12 @@ def compared_pairs(results: Results, group: str | None = None) -> list[tuple[Con
 
 
 def content(trainings: Trainings) -> bytes:
-    """Return all episodes of a group under a condition as bytes: equal where the simulation is the same."""
+    """Return all episodes of a group under a condition as bytes; equal bytes mean the same simulation."""
     return b"".join(own.tobytes() for own in trainings.values())
 
 
 def _compared(results: Results, every: bool) -> Iterator[tuple[Condition, Condition, str]]:
-    """Yield condition, baseline and group of each change whose both ends were evaluated."""
+    """Yield condition, baseline and group of each change that was evaluated at both ends."""
     order = {at: rank for rank, at in enumerate(results.baselines())}
     pairs = [(*pair, group) for group in results.groups for pair in compared_pairs(results, group)]
     seen = set()
@@ -114,7 +117,7 @@ def _compared(results: Results, every: bool) -> Iterator[tuple[Condition, Condit
 def _change(
     at: Condition, baseline: Condition, group: str, here: Trainings, there: Trainings
 ) -> tuple[Change, np.ndarray]:
-    """Return a change of which nothing is known to be certain, and the p value of each training alone."""
+    """Return a change, not yet tested for certainty, and the uncorrected p value of each training."""
     success = values_of(here, "success")
     before = values_of({seed: there[seed] for seed in here}, "success")
     alone = np.array(
@@ -126,5 +129,5 @@ def _change(
 
 
 def _is_certain(p_values: np.ndarray) -> np.ndarray:
-    """Whether each test of a family is certain, bool (n,); the family may be empty."""
+    """Test which p values of a family are certain, bool (n,); the family may be empty."""
     return np.array(adjust("bh", list(p_values))) < 1 - CONFIDENCE if p_values.size else np.zeros(0, bool)

@@ -1,4 +1,4 @@
-"""A study and all that is computed of its results, which its pages and figures show."""
+"""Compute everything that the pages and figures of a study show."""
 
 import functools
 from collections.abc import Mapping
@@ -16,17 +16,18 @@ from jobs.study.tables import beside_text, key_of
 
 
 class Study(NamedTuple):
-    """A study and all that is computed of its results.
+    """A study, its results, and everything computed from them.
 
     Attributes:
-        name: Of its data.
+        name: Name of its data.
         said: Section `study` of its file.
-        results: What was evaluated.
-        changes: Of its conditions.
-        summaries: Of its groups.
+        results: Its episodes and their provenance.
+        changes: Effect of each condition on each group.
+        summaries: Estimates for each group and condition.
         families: Name -> a family and its findings.
         doses: Event errors of its conditions, if they were measured.
-        beside: What a family names beside itself -> `key_of` a test -> what was found there.
+        beside: The other study (STUDY or STUDY:FAMILY) and the family that shows its findings -> `key_of` a
+            test -> the finding there.
     """
 
     name: str
@@ -40,7 +41,7 @@ class Study(NamedTuple):
 
 
 def judge_all(said: Mapping[str, Any], results: Results) -> dict[str, tuple[Family, list[Finding]]]:
-    """Return name -> each family of a study and its findings."""
+    """Test all families of a study; return name -> the family and its findings."""
     rates = learned(said, results.groups)
     found = {family.name: (family, judge(family, results, rates)) for family in families_of(said, results)}
     return {name: (family, [one for one in own if one.difference is not None])
@@ -50,20 +51,20 @@ def judge_all(said: Mapping[str, Any], results: Results) -> dict[str, tuple[Fami
 def compute(
     name: str, said: Mapping[str, Any], results: Results, doses: list[Dose], data: Path | None
 ) -> Study:
-    """Compute all that the pages of a study show.
+    """Compute everything that the pages of a study show.
 
     Args:
-        name: Of its data.
+        name: Name of its data.
         said: Section `study` of its file.
-        results: What was evaluated.
+        results: Its results.
         doses: Event errors of its conditions, if they were measured.
-        data: Where other published studies are; None: none is shown beside.
+        data: Folder of the published studies; None: show no findings of other studies.
     """
     families = judge_all(said, results)
     named = {(other, name) for name, (family, _) in families.items() for other in family.beside.values()}
     beside = {(other, name): found for other, name in named
               if data and (found := _beside(data, *place_beside(other, name))) is not None}  # fmt: skip
-    every = bool(said.get("doses"))  # a plan that was written before names all of its conditions
+    every = bool(said.get("doses"))  # show all planned conditions
     return Study(
         name, said, results, changes_of(results, every), summaries_of(results), families, doses, beside
     )
@@ -71,20 +72,20 @@ def compute(
 
 @functools.cache
 def published(data: Path, name: str, spec: str) -> Study:
-    """Compute a published study by the file of `spec`."""
+    """Compute the published study `name` with the families and figures of the study `spec`."""
     said = read_study(spec)
     return compute(name, said, read_published(data, name), read_doses(data / f"{name}_doses.csv"), data)
 
 
 def place_beside(said: str, name: str) -> tuple[str, str]:
-    """Return study and family of STUDY or STUDY:FAMILY; `name` is the family that names it."""
+    """Split STUDY or STUDY:FAMILY into study and family; without FAMILY, the family is `name`."""
     study, _, family = said.partition(":")
     return study, family or name
 
 
 @functools.cache
 def _beside(data: Path, name: str, family: str) -> dict[tuple[str, ...], str] | None:
-    """Return what a family of a published study found; None if the study is not there."""
+    """Return the findings of a family of a published study as texts; None if there is no such study."""
     if not (data / f"{name}_about.json").is_file():
         return None
     own, findings = _judged(data, name)[family]

@@ -1,8 +1,8 @@
-"""Tests of a family: the difference of each, its p value after the correction, and the verdict.
+"""Run the tests of a family: difference, corrected p value, and verdict of each.
 
-One rule for all families. A difference is certain if p is below 0.05 after the correction. Otherwise the
-interval of the single test decides: it may exclude a gain of the smallest difference that matters, a loss of
-it, or both. Whether such an exclusion is certain in its family, too, is said apart (`Finding.excluded`).
+All families follow one rule. A difference is certain if its corrected p is below 0.05. Otherwise the interval
+of the single test decides: it may exclude a gain as large as the smallest difference that matters, a loss as
+large, or both. `Finding.excluded` says whether such an exclusion is also certain within the family.
 """
 
 import math
@@ -30,21 +30,21 @@ from jobs.study.results import RATE, Condition, Results, values_of
 from jobs.study.spec import LEARNED, Contrast, Family, Side
 
 UNDECIDED, NOT_TESTED = "undecided", "not tested"
-Learned = Mapping[str, Mapping[str, Sequence[float]]]  # measure -> group -> its trainings, 0..1
+Learned = Mapping[str, Mapping[str, Sequence[float]]]  # measure -> group -> value of each training, 0..1
 
 
 class Finding(NamedTuple):
-    """What was found of a test.
+    """The finding of a test.
 
     Attributes:
         contrast: The test.
-        difference: Its value, interval and p alone; None: there is nothing to compare.
-        adjusted_p: After the correction of its family; None: there is no test.
+        difference: Value, interval and uncorrected p; None: there is nothing to compare.
+        adjusted_p: p after the family's correction; None: not tested.
         verdict: A word of the family, `UNDECIDED` or `NOT_TESTED`.
-        needed: Trainings of each side that would show a difference that matters, if it is undecided; None:
-            no number would in these corridors, or it was not asked.
-        excluded: Word of the family -> whether it is certain among all of its tests; of what the interval of
-            the test alone excludes.
+        needed: Number of trainings per side that would show a difference that matters, for undecided tests.
+            None: no number would in these corridors, or the family does not ask.
+        excluded: The family's word for each exclusion by the test's own interval -> whether the exclusion is
+            certain among all tests of the family.
     """
 
     contrast: Contrast
@@ -56,12 +56,12 @@ class Finding(NamedTuple):
 
 
 def judge(family: Family, results: Results, learned: Learned | None = None) -> list[Finding]:
-    """Test a family.
+    """Run all tests of a family.
 
     Args:
-        family: Its tests.
-        results: What was evaluated.
-        learned: How well each training did while it learned, for tests about that.
+        family: The family.
+        results: The episodes.
+        learned: Success of each training while it learned, for tests of learning speed.
     """
     sides = [compared_values(one, results, learned or {}) for one in family.contrasts]
     found = [_difference(one, *pair) for one, pair in zip(family.contrasts, sides, strict=True)]
@@ -88,10 +88,10 @@ def margin_of(family: Family, contrast: Contrast) -> float:
 def exclusions(family: Family, found: Sequence[Difference | None]) -> list[dict[str, bool]]:
     """Return what the interval of each test excludes, and whether that is certain in the family.
 
-    Gains and losses are a family each: one-sided tests, corrected as the family's own.
+    Gains and losses are separate families of one-sided tests, with the same correction as the family's own.
 
     Returns:
-        For each test the word of the family -> whether it is certain, see `Finding.excluded`.
+        One mapping for each test, see `Finding.excluded`.
     """
     excluded: list[dict[str, bool]] = [{} for _ in found]
     for name in ("no_gain", "no_loss"):
@@ -114,7 +114,7 @@ def _p_within(one: Difference, margin: float, name: str) -> float:
 
 
 def adjust(correction: str, p_values: Sequence[float]) -> list[float]:
-    """Return p values corrected for being a family ("holm", "bh"), or as they are ("none")."""
+    """Correct the p values of a family by "holm" or "bh"; "none" returns them unchanged."""
     if correction == "holm":
         return holm(p_values)
     if correction == "bh" and len(p_values):
@@ -125,7 +125,7 @@ def adjust(correction: str, p_values: Sequence[float]) -> list[float]:
 def verdict_of(
     difference: Difference | None, adjusted_p: float | None, margin: float, words: Mapping[str, str]
 ) -> str:
-    """Return the verdict of a test in the words of its family, see the top of this file."""
+    """Return the verdict of a test in the words of its family, by the rule at the top of this file."""
     if difference is None:
         return NOT_TESTED
     if difference.interval is None or adjusted_p is None:
@@ -142,7 +142,7 @@ def verdict_of(
 def compared_values(
     contrast: Contrast, results: Results, learned: Learned
 ) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Return what a test compares of both sides, (trainings, corridors) each; None: nothing was evaluated."""
+    """Return the values of both sides, (trainings, corridors) each; None if missing or not evaluated."""
     ours, theirs = contrast.ours, contrast.theirs
     if contrast.measure in LEARNED:
         rates = learned.get(contrast.measure, {})
@@ -172,7 +172,7 @@ def side_values(side: Side, measure: str, results: Results, seeds: Sequence[int 
 
 
 def _evaluated(ours: Side, theirs: Side | None, results: Results) -> tuple[Side, Side | None]:
-    """Leave out the conditions under which a side was not evaluated, if both have the same out of both."""
+    """Leave out conditions under which a side was not evaluated; out of both if they have the same ones."""
 
     def there(side: Side) -> list[bool]:
         places = zip(side.at, side.less, strict=True) if _is_matched(side) else zip(side.at)
@@ -191,18 +191,18 @@ def _evaluated(ours: Side, theirs: Side | None, results: Results) -> tuple[Side,
 
 
 def _is_matched(side: Side) -> bool:
-    """Whether one condition is subtracted from each."""
+    """Whether the conditions are subtracted one by one."""
     return len(side.less) == len(side.at)
 
 
 def _seeds(side: Side, results: Results) -> list[int | None]:
-    """Return the trainings that were evaluated under all conditions of a side."""
+    """Return the seeds of the trainings that were evaluated under all conditions of a side."""
     every = [set(results.trainings(at, side.group)) for at in (*side.at, *side.less)]
     return sorted(set.intersection(*every) if side.at else (), key=lambda seed: (seed is None, seed or 0))
 
 
 def _difference(contrast: Contrast, ours: np.ndarray | None, theirs: np.ndarray | None) -> Difference | None:
-    """Return ours minus theirs, or ours alone; of one training nothing follows for others."""
+    """Return ours minus theirs, or ours alone; no interval for an unpaired group with a single training."""
     if ours is None:
         return None
     if theirs is None:
@@ -216,7 +216,7 @@ def _difference(contrast: Contrast, ours: np.ndarray | None, theirs: np.ndarray 
 
 
 def bounds_of(contrast: Contrast, *values: np.ndarray) -> Interval | None:
-    """Return the least and the greatest value that a side can have; None: a side has no corridors."""
+    """Return the smallest and largest possible value of a side; None for learning speed."""
     if contrast.measure in LEARNED:
         return None
     low, high = RATE if contrast.measure == "success" else reach(*values)
@@ -224,7 +224,7 @@ def bounds_of(contrast: Contrast, *values: np.ndarray) -> Interval | None:
 
 
 def reach(*distances_m: np.ndarray) -> Interval:
-    """Return the least and the greatest distance of an episode [m]: at most the goal line's."""
+    """Return the smallest and largest possible distance of an episode [m]: 0 and the goal line's."""
     return 0.0, max(Scene.length_m, *(float(own.max()) for own in distances_m))
 
 
@@ -238,7 +238,7 @@ class Row(NamedTuple):
 
 
 def by_condition(contrast: Contrast, results: Results) -> list[Row]:
-    """Return a test of two groups under each of its conditions alone."""
+    """Split a test of two groups into its conditions; return success and difference under each."""
     rows, other = [], contrast.theirs
     for at in contrast.ours.at if other is not None else ():
         theirs_at = None if other is None else other._replace(at=(at,))

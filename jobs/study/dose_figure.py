@@ -1,4 +1,4 @@
-"""Change of success against event error, a panel for each group, a line for each kind of wrong events."""
+"""Draw change of success against event error: a panel for each group, a line for each kind of error."""
 
 from collections.abc import Collection, Mapping, Sequence
 
@@ -14,21 +14,21 @@ from jobs.study.computed import Study
 from jobs.study.results import Condition
 from jobs.study.spec import Section
 
-# Colour and marker of each kind: Okabe and Ito's, which the colour-blind tell apart too.
+# Colour and marker of each kind of error; the colour-blind safe palette of Okabe and Ito.
 KINDS = {
     "lost": ("#0072b2", "o"), "displaced": ("#009e73", "s"), "flipped": ("#e69f00", "^"),
     "invented": ("#d55e00", "D"), "jittered": ("#cc79a7", "v"),
 }  # fmt: skip
 OTHER = ("#6b7280", ".")
-DODGE = 0.09  # between kinds at the same dose, in roots of per cent
+DODGE = 0.09  # sideways shift between kinds at the same dose, in units of the square-root axis
 TICKS = (0, 1, 5, 10, 20, 40)  # event error [%]
 
 
 def dose_figure(study: Study, said: Section) -> Figure:
-    """Draw a panel for each group: change of success [points] with its interval, a line for each kind.
+    """Draw a panel for each group: change of success [points] with interval, a line for each kind of error.
 
-    Markers of what trainings met are hollow. Axes that end with `dashed` are the same conditions behind a
-    filter, drawn as dashed lines without intervals.
+    Markers of conditions in a group's training distribution are hollow. Axes whose names end with `dashed`
+    are the same conditions behind a filter, drawn as dashed lines without intervals.
     """
     errors = {one.condition: one.measured for one in study.doses}
     met = {(one.condition, group) for one in study.doses for group in one.met_by}
@@ -83,9 +83,9 @@ def _draw_kind(
     aside: float,
     met: Collection[tuple[Condition, str]] | None = None,
 ) -> None:
-    """Draw the line of one kind through no error and no change, its intervals, and a marker for each dose.
+    """Draw one kind of error: a line from the origin, intervals, and a marker for each dose.
 
-    Markers of what is `met` are hollow; None: all are, and the line is dashed, without intervals.
+    Markers of conditions in `met` are hollow. None: all are hollow; the line is dashed, without intervals.
     """
     if not changes:
         return

@@ -1,4 +1,4 @@
-"""Event errors of the conditions of a study that makes events wrong: asked for, and measured."""
+"""Event errors of the conditions of a study that corrupts events: intended and measured."""
 
 import csv
 from collections.abc import Mapping, Sequence
@@ -15,13 +15,13 @@ HEAD = ("Axis", "Value", "asked_event_error", "measured_event_error", "met_by")
 
 
 class Dose(NamedTuple):
-    """One condition.
+    """Event error of one condition.
 
     Attributes:
         condition: Kind of error, and its setting.
-        asked: Event error that it stands for; None: it is only measured.
-        measured: Event error against the same sensor without it.
-        met_by: Groups whose trainings met as much of the kind.
+        asked: Intended event error; None: it is only measured.
+        measured: Event error against the same sensor without this kind of error.
+        met_by: Groups whose training distribution includes this condition.
     """
 
     condition: Condition
@@ -34,9 +34,9 @@ def measure_doses(study: Mapping[str, Any], results: Results, env: EnvConfig) ->
     """Measure the event error of each condition of the axes in `doses` of a study's file.
 
     Args:
-        study: Section `study` of its file; `doses` maps an axis to the errors that its points stand for.
-        results: What was evaluated.
-        env: The simulation with nothing changed.
+        study: Section `study` of its file; `doses` maps an axis to the intended error of each point.
+        results: The results of the study.
+        env: The simulation of the nominal condition.
     """
     found = []
     for axis, asked in (study.get("doses") or {}).items():
@@ -49,7 +49,7 @@ def measure_doses(study: Mapping[str, Any], results: Results, env: EnvConfig) ->
 
 
 def write_doses(file: Path, doses: Sequence[Dose]) -> None:
-    """Write the table of the doses, which `read_doses` reads."""
+    """Write the table of the doses for `read_doses`."""
     rows = [
         (one.condition[0], text_of(one.condition[1]), "" if one.asked is None else f"{one.asked:.4f}",
          f"{one.measured:.4f}", " ".join(one.met_by))

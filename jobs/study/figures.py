@@ -1,4 +1,4 @@
-"""The figures of a study's page, one function for each `kind` that its file can name."""
+"""Figures of a study's page, one function for each `kind` that its file can name."""
 
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
@@ -31,7 +31,7 @@ COLOURS = {"above": GREEN, "below": RED, "within": BLUE, "no_gain": AMBER, "no_l
 
 
 def change_map(study: Study, said: Section) -> Figure:
-    """Draw success [%] of conditions x groups, coloured by its change; the first row is the baseline."""
+    """Draw success [%] by condition and group, coloured by its change; the first row is the baseline."""
     changes = study.changes
     columns = [group for group in study.results.groups if any(change.group == group for change in changes)]
     rows = [at for at in study.results.conditions if any(change.condition == at for change in changes)]
@@ -63,7 +63,7 @@ def change_map(study: Study, said: Section) -> Figure:
 
 
 def _write_cell(panel: Axes, success: np.ndarray, points: float, row: int, column: int, weight: str) -> None:
-    """Write the mean success [%] of a cell, once, in a colour that its ground lets read."""
+    """Write the mean success [%] into a cell in a legible colour, unless it is already there."""
     text = f"{100 * success.mean():.0f}"
     written = {(one.get_position(), one.get_text()) for one in panel.texts}
     if ((column, row), text) not in written:
@@ -72,7 +72,7 @@ def _write_cell(panel: Axes, success: np.ndarray, points: float, row: int, colum
 
 
 def forest(study: Study, said: Section) -> Figure:
-    """Draw each test of a family with its interval, a panel for each unit, coloured by the verdict."""
+    """Draw each test of a family with its interval, coloured by the verdict; a panel for each unit."""
     family, tested = study.families[said["family"]][0], tested_of(study, said)
     units = list(dict.fromkeys(scale_of(one.contrast) for one in tested))
     sizes = [sum(scale_of(one.contrast) == unit for one in tested) for unit in units]
@@ -101,7 +101,7 @@ def forest(study: Study, said: Section) -> Figure:
 
 
 def tested_of(study: Study, said: Section) -> list[Finding]:
-    """Return the findings of a figure's family that have an interval; single trainings have none."""
+    """Return the findings with an interval of the figure's family; single trainings have no interval."""
     findings = study.families[said["family"]][1]
     return [one for one in findings if one.difference and one.difference.interval]
 
@@ -113,14 +113,14 @@ def _label(one: Finding) -> str:
 
 
 def still_going(episodes: np.ndarray, length_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the share of episodes that have not ended before a distance, as the corners of a step function.
+    """Return the share of episodes still running at a distance, as the corners of a step function.
 
     Args:
         episodes: EPISODE (n,), at least one.
-        length_m: Where the goal line is; episodes that reach it go on to there [m].
+        length_m: Distance of the goal line; successful episodes last until there [m].
 
     Returns:
-        Distances from 0 to the goal line, rising [m], and the share that gets beyond each [-].
+        Ascending distances from 0 to the goal line [m], and the share of episodes that get beyond each [-].
     """
     ends = np.sort(np.minimum(episodes["distance_m"][~episodes["success"]], length_m))
     beyond = 1.0 - np.arange(1, ends.size + 1) / episodes.size
@@ -129,7 +129,7 @@ def still_going(episodes: np.ndarray, length_m: float) -> tuple[np.ndarray, np.n
 
 
 def worst_conditions(results: Results, changes: Sequence[Change]) -> dict[str, Condition]:
-    """Return group -> the condition in which it succeeds least, of groups that were evaluated unchanged."""
+    """Return group -> its condition with the lowest success, for groups evaluated in the nominal one."""
     found = {}
     for group in dict.fromkeys(change.group for change in changes):
         if (results.nominal, group) in results.cells:
@@ -139,7 +139,7 @@ def worst_conditions(results: Results, changes: Sequence[Change]) -> dict[str, C
 
 
 def survival(study: Study, said: Section) -> Figure:
-    """Draw the share of episodes still going over distance, unchanged and in the worst condition."""
+    """Draw the share of episodes still running over distance, in the nominal and in the worst condition."""
     results, worst = study.results, worst_conditions(study.results, study.changes)
     length_m = _scene(results).length_m
     figure, panels = panel_grid(max(len(worst), 1), 4, (2.9, 2.2), (0.4, 0.5), sharex=True, sharey=True)
@@ -166,7 +166,7 @@ def _scene(results: Results) -> Any:
 
 
 def numeric_axes(results: Results) -> list[str]:
-    """Return the axes along which one number alone changes."""
+    """Return the axes along which a single number changes."""
     return [
         axis
         for axis, points in results.axes.items()
@@ -175,7 +175,7 @@ def numeric_axes(results: Results) -> list[str]:
 
 
 def axes_map(study: Study, said: Section) -> Figure:
-    """Draw success along the axes of numbers: the groups of `said` with intervals, all others in grey."""
+    """Draw success along the numeric axes: the groups in `said` with intervals, all others in grey."""
     axes = {axis: [one for one in study.summaries if one.condition[0] == axis]
             for axis in numeric_axes(study.results)}  # fmt: skip
     there = {one.group for own in axes.values() for one in own}
@@ -198,7 +198,7 @@ def axes_map(study: Study, said: Section) -> Figure:
 
 
 def _draw_group(panel: Axes, found: Sequence[Summary], values: Sequence[object], place: float | None) -> None:
-    """Draw a group's success over the places of the values: aside by `place` with intervals, or in grey."""
+    """Draw a group's success over the index of each value: with intervals, shifted by `place`; None: grey."""
     x = np.array([values.index(one.condition[1]) for one in found], float)
     y = [100 * one.success.value for one in found]
     if place is None:
@@ -212,7 +212,7 @@ def _draw_group(panel: Axes, found: Sequence[Summary], values: Sequence[object],
 
 
 def contacts(study: Study, said: Section) -> Figure:
-    """Draw where episodes end in contact, seen from above."""
+    """Draw the places where episodes end in contact, seen from above."""
     scene = _scene(study.results)
     return contact_map(contact_ends(study.results), scene.length_m, scene.width_m / 2)
 
@@ -220,12 +220,12 @@ def contacts(study: Study, said: Section) -> Figure:
 def contact_map(
     ends: Mapping[str, tuple[np.ndarray, np.ndarray]], length_m: float, half_width_m: float
 ) -> Figure:
-    """Draw where episodes of each group ended in contact.
+    """Draw the places where episodes of each group ended in contact.
 
     Args:
-        ends: Group -> EPISODE without any change, and EPISODE under all changes in the same scene.
-        length_m: Where the goal line is [m].
-        half_width_m: Where the walls are [m].
+        ends: Group -> EPISODE in the nominal condition, and EPISODE under all changes in the same scene.
+        length_m: Distance of the goal line [m].
+        half_width_m: Distance of the walls from the middle [m].
     """
     figure, panels = panel_grid(len(ends), 2, (6.6, 2.3), (0.0, 0.7), sharex=True, sharey=True)
     for panel, (group, (unchanged, changed)) in zip(panels, ends.items(), strict=True):
@@ -242,7 +242,7 @@ def contact_map(
 
 
 def _draw_contacts(panel: Axes, group: str, unchanged: np.ndarray, changed: np.ndarray) -> None:
-    """Draw the contacts of one group as dots, large where nothing was changed."""
+    """Draw the contacts of one group as dots, large for the nominal condition."""
     colour, usual, others = style_of(group)[0], *(rows[rows["collision"]] for rows in (unchanged, changed))
     panel.scatter(usual["distance_m"], usual["x_m"], s=26, alpha=0.95, color=colour, edgecolors="white",
                   lw=0.5, zorder=3)  # fmt: skip
@@ -254,9 +254,10 @@ def _draw_contacts(panel: Axes, group: str, unchanged: np.ndarray, changed: np.n
 
 
 def contact_ends(results: Results) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Return group -> EPISODE unchanged, and under all changes in the same scene, no simulation twice.
+    """Return group -> EPISODE in the nominal condition, and under all changes in the same scene.
 
-    What is the same simulation depends on the group: a policy that sees no events is not changed by faults.
+    Equal simulations count once. Which are equal depends on the group: event faults do not affect a policy
+    that sees no events.
     """
     usual = results.facts["scene"]
     here = [at for at in results.conditions if results.axes[at[0]][at[1]].get("env.scene", usual) == usual]
@@ -274,7 +275,7 @@ def contact_ends(results: Results) -> dict[str, tuple[np.ndarray, np.ndarray]]:
 
 
 def lines(study: Study, said: Section) -> Figure:
-    """Draw success along axes: a panel for each value of a tag, a line for each value of another and axis."""
+    """Draw success along axes: a panel per value of one tag, a line per axis and value of another tag."""
     results, tags = study.results, tags_of(study.said, study.results)
     panels_of = sorted({tags[group][said["panels"]] for group in results.trained})
     figure = Figure(figsize=(3.4 * len(panels_of), 3.4), layout="constrained")
@@ -301,7 +302,7 @@ def lines(study: Study, said: Section) -> Figure:
 
 
 def _same_episodes(results: Results, one: str, other: str, group: str) -> bool:
-    """Whether a group has the same episodes along two axes, as far as both have a value."""
+    """Whether a group has the same episodes along two axes, at the values that both axes have."""
     shared = [value for value in results.axes[other] if value in results.axes[one]]
     return all(
         content(results.trainings((one, value), group)) == content(results.trainings((other, value), group))
@@ -344,7 +345,7 @@ def dots(study: Study, said: Section) -> Figure:
 
 
 def spread(study: Study, said: Section) -> Figure:
-    """Draw the mean success of every training as a map, and by what it differs under each condition."""
+    """Draw the mean success of every training as a map, and its spread by each factor per condition."""
     tables, names = crossed_tables(study.said, study.results), study.said["spread"]
     mean = 100 * np.mean(list(tables.values()), axis=0)
     figure = Figure(figsize=(9.6, 3.6), layout="constrained")
@@ -380,7 +381,7 @@ def _draw_numbers(panel: Axes, values: np.ndarray, low: float = 0.0, high: float
 
 
 def variants(study: Study, said: Section) -> Figure:
-    """Draw success by variant and condition as a map, and the tests of a family with a dot for each pair."""
+    """Draw success by variant and condition as a map, and a family's tests with a dot for each pair."""
     results, (_, findings) = study.results, study.families[said["family"]]
     groups, found = results.trained, {one.contrast.ours.group: one for one in findings}
     values = np.array(
@@ -406,7 +407,7 @@ def variants(study: Study, said: Section) -> Figure:
 
 
 def pair_differences(results: Results, one: Finding) -> np.ndarray:
-    """Return the difference of each pair of trainings of one seed, (n,)."""
+    """Return the difference of success, -1..1, of each pair of trainings with the same seed, (n,)."""
     ours, theirs = one.contrast.ours.group, one.contrast.theirs.group  # type: ignore[union-attr]
     seeds = [seed for seed in results.groups[ours] if seed in results.groups[theirs]]
     rates = [np.mean([[results.cells[at, group][seed]["success"].mean() for seed in seeds]
@@ -427,7 +428,7 @@ KINDS: dict[str, Callable[[Study, Section], Figure]] = {
     "spread": spread,
     "variants": variants,
 }
-# What a kind cannot be drawn without, of the kinds for which data may lack it.
+# Data that a kind of figure needs, for kinds whose data may be missing; empty: no figure is drawn.
 NEEDED: dict[str, Callable[[Study, Section], object]] = {
     "map": lambda study, said: study.changes,
     "forest": tested_of,

@@ -1,4 +1,4 @@
-"""How well the trainings of a study did while they learned, from the learning curves beside its policies."""
+"""Measure learning speed: success of a study's trainings during training, from published learning curves."""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -8,11 +8,11 @@ from jobs.run.provenance import REPOSITORY
 from jobs.study.contrasts import Learned
 from jobs.tools.curves import published_trainings
 
-VARIANT = "VARIANT"  # stands for a group in the place of its published policies
+VARIANT = "VARIANT"  # stands for the group's name in `study.published`
 
 
 def published_place(study: Mapping[str, Any], group: str) -> Path | None:
-    """Return where the published policies of a group are, but for "-s0" and so on; None: nowhere.
+    """Return the path of a group's published policies without "-s0" and so on; None: there are none.
 
     Args:
         study: Section `study` of its file.
@@ -31,7 +31,7 @@ def learned(study: Mapping[str, Any], groups: Iterable[str]) -> Learned:
 
     Args:
         study: Section `study` of its file.
-        groups: Of its results.
+        groups: The groups in its results.
     """
     places = {group: published_place(study, group) for group in groups}
     curves = {

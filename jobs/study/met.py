@@ -1,4 +1,4 @@
-"""Whether a training met what a sweep evaluates: a robustness that was trained is not one that was found."""
+"""Decide whether a condition lies within a training distribution: trained robustness is no generalization."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -23,24 +23,25 @@ COMPARED = [key for key in ENV_KEYS if key not in NO_CONDITION and not key.start
 def met(
     conditions: Sequence[Mapping[str, Any]], trained: EnvConfig, nominal: EnvConfig, cell: EnvConfig
 ) -> bool:
-    """Whether a training's episodes could have what distinguishes a cell of a sweep from the nominal one.
+    """Whether a training could draw the settings in which a condition differs from the nominal one.
 
-    One rule for all tables. A word counts as met if a condition may draw it. A number does between the
-    smallest and the largest that any of the training's episodes may have, among them those of conditions that
-    leave it as it is: where some have 0 and some 0.3, 0.2 is met. One condition must draw all that
-    distinguishes the cell; a cell in which nothing changes, or whose scene is a mesh, is not met.
+    All tables follow one rule. A word counts as met if a training condition may draw it. A number counts as
+    met if it lies between the smallest and the largest value in any training episode, including conditions
+    that do not change it: if some have 0 and others 0.3, then 0.2 is met. A single training condition must
+    draw all of the differing settings. A condition without differences, or with a mesh as its scene, is not
+    met.
 
     Args:
-        conditions: Of the training, as `TrainConfig`.
-        trained: The simulation that they change.
-        nominal: The simulation of the sweep with nothing changed.
-        cell: That of the cell.
+        conditions: The training's conditions, as in `TrainConfig`.
+        trained: The simulation that the training's conditions change.
+        nominal: The simulation of the nominal condition.
+        cell: The simulation of the condition in question.
     """
     if not _is_drawn(cell.scene):
         return False
     before, here = settings_of(nominal), settings_of(cell)
     changed = {key: value for key, value in here.items() if before.get(key) != value}
-    if any(key.startswith(LAYOUT) for key in changed):  # another world, of which nothing may be new
+    if any(key.startswith(LAYOUT) for key in changed):  # another layout: all of it must be met
         changed |= {key: value for key, value in here.items() if key.startswith(LAYOUT)}
     every = [_drawn_settings(condition, trained) for condition in conditions]
     return bool(changed) and any(
@@ -52,7 +53,7 @@ def met(
 
 
 def settings_of(env: EnvConfig) -> dict[str, object]:
-    """Return the settings that tell conditions apart, by their keys; a scene as the fields of its layout."""
+    """Return the settings that distinguish conditions: key -> value, a scene as the fields of its layout."""
     values: dict[str, Any] = {}
     for key in COMPARED:
         value: Any = env
@@ -74,7 +75,7 @@ def _is_drawn(scene: str) -> bool:
 
 
 def _drawn_settings(condition: Mapping[str, Any], trained: EnvConfig) -> dict[str, list[object]]:
-    """Return, for each setting, the values that a condition may draw; for a range, its ends."""
+    """Return setting -> values that a condition may draw; of a range only its ends."""
     ends = {key: _ends(value) for key, value in condition.items() if key != WEIGHT}
     scenes = [scene for scene in ends.pop("env.scene", [trained.scene]) if _is_drawn(scene)]
     worlds = [settings_of(env_with(trained, {"env.scene": scene})) for scene in scenes]
@@ -93,7 +94,7 @@ def _may_be(drawn: Sequence[Any], value: object) -> bool:
 
 
 def _lies_between(drawn: Sequence[Any], value: object) -> bool:
-    """Whether a number lies between the ends of the numbers among `drawn`; False for what is no number."""
+    """Whether a value is a number between the smallest and the largest number in `drawn`."""
     numbers = [one for one in drawn if _is_number(one)]
     return _is_number(value) and bool(numbers) and min(numbers) <= value <= max(numbers)
 

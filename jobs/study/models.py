@@ -28,7 +28,7 @@ HEAD = (
     "policy", "seeds", "method", "input", "trained in", "steps", "MB",
     "nominal [%]", "mean [%]", "worst [%]", "under",
 )  # fmt: skip
-WORDS = 5  # columns of words
+WORDS = 5  # leading columns with text
 INPUTS = {
     "bytestream": "latent of events (t, x, y, p)",
     "bytestream_xy": "latent of events (x, y)",
@@ -38,8 +38,8 @@ INPUTS = {
     "event_image_vae": "latent of event images",
     "rgb": "grey camera image",
 }
-TAUGHT = "taught_"  # begins the names of the policies of the study `taught`
-# File of a study -> what the names of its groups begin with.
+TAUGHT = "taught_"  # prefix of the policies of the study `taught`
+# File of a study -> prefix of its groups' names.
 EPISODES = {"robustness": "", "taught": TAUGHT, "body_conditions": ""}
 LOAD = 'load_policy(PRETRAINED / "bytestream_hold-s0")'
 
@@ -47,12 +47,13 @@ Condition = tuple[str, str]
 
 
 class Success(NamedTuple):
-    """Success of a group over the conditions of one sweep, means over seeds and corridors.
+    """Success of a group over the conditions of one study, averaged over seeds and corridors.
 
     Attributes:
-        nominal, mean, worst: Share of episodes that reach the goal, in 0 to 1.
+        nominal, mean, worst: Share of episodes that reach the goal, 0..1: in the nominal condition, averaged
+            over all conditions, and in the worst one.
         condition: The worst condition.
-        conditions: How many different ones there are.
+        conditions: Number of different conditions.
     """
 
     nominal: float
@@ -66,12 +67,13 @@ class Group(NamedTuple):
     """The shipped policies of one experiment.
 
     Attributes:
-        name: Of the group; a policy is called `name-sSEED`.
-        kind, method: What it sees by, and how it learns.
-        seeds: Of its policies.
-        conditions: How many an episode of its training draws from; 1: none is drawn.
-        env_steps: Of its training.
-        megabytes: Size of one policy on the disk.
+        name: Name of the group; a policy is called `name-sSEED`.
+        kind: Name of the model.
+        method: "imitation" or "PPO".
+        seeds: Training seeds of its policies.
+        conditions: Number of conditions that a training episode draws from; 1: no randomization.
+        env_steps: Environment steps of its training.
+        megabytes: Size of one policy on disk [MB].
     """
 
     name: str
@@ -95,7 +97,7 @@ def shipped_groups(folder: Path) -> list[Group]:
     """Return the groups of shipped policies in a folder, by name.
 
     Args:
-        folder: Of policy folders, `NAME-sSEED`, each with its manifest.
+        folder: Holds policy folders `NAME-sSEED`, each with its manifest.
     """
     found: dict[str, list[Path]] = defaultdict(list)
     for manifest in sorted(folder.glob(f"*/{MANIFEST}")):
@@ -118,9 +120,9 @@ def _group(name: str, files: Sequence[Path]) -> Group:
 
 
 def success_rates(episodes: Path) -> dict[str, Success]:
-    """Return the success of each group of a sweep; none without the file.
+    """Return the success of each group of a study; empty if the file does not exist.
 
-    Conditions with the same episodes in every group are one simulation, and count once.
+    Conditions with the same episodes in every group are the same simulation and count once.
 
     Args:
         episodes: A file of docs/data with a row for each episode.
@@ -149,12 +151,12 @@ def _success(rates: Mapping[Condition, float]) -> Success:
 
 
 def model_rows(study: str, folder: Path, data: Path) -> list[tuple[str, ...]]:
-    """Return a row for each group that a sweep evaluated, the best mean first, as texts under `HEAD`.
+    """Return a row of texts under `HEAD` for each group that a study evaluated, the best mean first.
 
     Args:
         study: A key of `EPISODES`.
-        folder: Of policy folders.
-        data: Of the published episodes.
+        folder: Holds the policy folders.
+        data: Holds the published episodes.
     """
     prefix = EPISODES[study]
     rates = success_rates(data / f"{study}_episodes.csv.gz")
@@ -178,7 +180,7 @@ def _row(group: Group, success: Success) -> tuple[str, ...]:
 
 
 def _ranges(seeds: Sequence[int]) -> str:
-    """Return seeds as text, neighbours as a range: "0-2"."""
+    """Return seeds as text, consecutive ones as a range: "0-2"."""
     runs = [
         [seed for _, seed in own]
         for _, own in itertools.groupby(enumerate(seeds), lambda one: one[1] - one[0])
@@ -187,7 +189,7 @@ def _ranges(seeds: Sequence[int]) -> str:
 
 
 def models_tables(folder: Path = PRETRAINED, data: Path = DATA) -> dict[str, str]:
-    """Return the tables of docs/models.md: name of the sweep -> Markdown."""
+    """Return the tables of docs/models.md: name of the study -> Markdown."""
     named = {study: model_rows(study, folder, data) for study in EPISODES}
     return {
         study: markdown_table(HEAD, [(f"`{name}`", *cells) for name, *cells in rows], WORDS)

@@ -1,8 +1,8 @@
-"""What stands on the pages of a study: parts between marks, filled from its data alone.
+"""Fill the pages of a study: the parts between marks are generated from its data alone.
 
-A page is written by hand but for its marks. `<!-- study NAME PART -->` begins a part, `<!-- end of study -->`
-ends it; what is between them is replaced. `results` is the usual choice of all parts, `provenance` says what
-made them. NAME:DATA takes the file of one study and the data of another.
+The rest of a page is written by hand. `<!-- study NAME PART -->` begins a part, `<!-- end of study -->` ends
+it, and the text between them is replaced. The part `results` combines the usual parts; `provenance` states
+command, commit and date. NAME:DATA takes the file of one study and the data of another.
 """
 
 import re
@@ -31,7 +31,7 @@ FOUND_MET = f"{MET} The condition lies within what the group was trained on."
 
 
 def figures(study: Study) -> dict[str, Figure]:
-    """Return name -> each figure of a study that its data suffice for."""
+    """Draw the figures of a study for which it has the data; return name -> figure."""
     return {name: KINDS[said["kind"]](study, said) for name, said in _figures(study).items()}
 
 
@@ -47,7 +47,7 @@ def part(study: Study, name: str) -> str:
     """Return a part of a study's pages as Markdown.
 
     Raises:
-        KeyError: There is no such part.
+        KeyError: No part has this name.
     """
     kind, _, own = name.partition(":")
     return PARTS[kind](study, own).strip("\n")
@@ -57,19 +57,19 @@ def fill(text: str, find: Callable[[str, str], str]) -> str:
     """Return the text of a page with its parts filled.
 
     Args:
-        text: Of the page.
-        find: Name of a study, as the mark has it, and part -> Markdown.
+        text: Text of the page.
+        find: Returns the Markdown for a mark's study name and part.
     """
     return MARK.sub(lambda found: f"{found[1]}\n{find(found[2], found[3])}\n\n{found[4]}", text)
 
 
 def marked(texts: Iterable[str]) -> list[str]:
-    """Return the names of the studies that pages have marks of."""
+    """Return the names of the studies with marks on these pages."""
     return list(dict.fromkeys(found[2] for text in texts for found in MARK.finditer(text)))
 
 
 def new_page(name: str) -> str:
-    """Return a page with marks for all of a study."""
+    """Return a page with marks for the results and the provenance of a study."""
     parts = {part: EMPTY.format(name=name, part=part) for part in ("results", "provenance")}
     return NEW_PAGE.format(name=name, **parts)
 
@@ -130,7 +130,7 @@ def _family(study: Study, name: str, heading: bool = False) -> str:
 
 
 def _tests(study: Study, name: str) -> str:
-    """Return the tests of a family without how they are to be read, which the page says once."""
+    """Return the table of a family's tests without the explanatory note."""
     family, findings = study.families[name]
     beside = {head: study.beside.get((other, name), {}) for head, other in family.beside.items()}
     return tables.family_table(family, findings, beside)
@@ -160,7 +160,7 @@ def _success(study: Study, _: str) -> str:
 def _axes(study: Study, _: str) -> str:
     results = study.results
     lines = []
-    for axis in list(results.axes)[1:]:  # the first is the condition that changes nothing
+    for axis in list(results.axes)[1:]:  # without the nominal condition
         conditions = [at for at in results.conditions if at[0] == axis]
         pooled = {
             group: np.hstack([values_of(results.trainings(at, group), "success") for at in conditions])
@@ -175,7 +175,7 @@ def _axes(study: Study, _: str) -> str:
 
 
 def _is_repeated(results: Results, at: Condition) -> bool:
-    """Whether a condition has the episodes of an earlier one that is the same simulation."""
+    """Whether a condition repeats the episodes of an earlier condition with the same simulation."""
     first = results.same_as[at]
     groups = results.groups
     return first != at and all(
@@ -193,7 +193,7 @@ def _changes(study: Study, _: str) -> str:
 
 
 def _losses(study: Study, which: str) -> str:
-    """Return what breaks each group; of `certain` only what is certain for other trainings."""
+    """Return the losses of each group; for `certain` only losses that are certain for other trainings."""
     tests = len(replicated(study.changes))
     if which == "certain":
         note = (
@@ -210,7 +210,7 @@ def _losses(study: Study, which: str) -> str:
 
 
 def _headline(study: Study, _: str) -> str:
-    """Return success [%] of each group under the conditions that the file names, best mean first."""
+    """Return success [%] of each group under the conditions of `headline`, the best mean first."""
     results, asked = study.results, study.said["headline"]
     shown: list[Condition] = [
         (axis, value_of(str(value))) for axis, values in asked.items() for value in values
@@ -228,7 +228,7 @@ def _headline(study: Study, _: str) -> str:
 
 
 def _provenance(study: Study, _: str) -> str:
-    """Return what made the results; a simulation that several conditions share is counted once."""
+    """Return the provenance of the results; a simulation shared by several conditions counts once."""
     facts, results, name = study.results.facts, study.results, study.name
     different = {(group, content(trainings)): trainings for (_, group), trainings in results.cells.items()}
     count = sum(len(own) for trainings in different.values() for own in trainings.values())

@@ -21,17 +21,18 @@ Axes = Mapping[str, Mapping[Value, Mapping[str, Any]]]  # axis -> value -> setti
 
 @dataclass(frozen=True)
 class Plan:
-    """All that a study evaluates.
+    """All evaluation tasks of a study.
 
     Attributes:
-        policies: Groups together, in the order in which they were named.
-        differences: Agent -> where its own sensor, with which it is evaluated, is not the configured one.
-        axes: The first axis is `NOMINAL`.
+        policies: The policies of each group side by side, groups in the order in which they were named.
+        differences: Agent -> settings in which its own sensor, used to evaluate it, differs from the
+            configured one.
+        axes: Axis -> its points; the first axis is `NOMINAL`.
         tasks: One for each policy and condition; two may share a key.
-        met: Condition and group of those that lie within what a training of the group drew.
+        met: Conditions that lie within the training distribution of a group, each with that group.
         baselines: Condition -> the condition it is compared with, see `baselines_of`.
-        own_baselines: Group -> the same for its own sensor and control rate, where they differ.
-        same_as: Condition -> the first one that is the same simulation for every policy.
+        own_baselines: Group -> `baselines` for its own sensor and control rate, if they differ.
+        same_as: Condition -> the first condition that is the same simulation for every policy.
     """
 
     policies: tuple[EvaluatedPolicy, ...]
@@ -45,7 +46,10 @@ class Plan:
 
     @property
     def identity(self) -> str:
-        """Return the hash of all that decides its metrics; frozen, so that earlier studies continue."""
+        """Return the hash of everything that determines the metrics.
+
+        Its format is frozen, so that studies begun by an earlier version can resume.
+        """
         facts = [[*map(text_of, task.condition), task.key, *task.seeds] for task in self.tasks]
         return settings_hash({"cells": facts})
 
@@ -64,7 +68,7 @@ class Plan:
 
 
 def plan_study(config: Config, policies: Sequence[EvaluatedPolicy]) -> Plan:
-    """Plan the tasks of a study: a policy keeps its own sensor, and each condition changes settings of that.
+    """Plan the tasks of a study. Each condition changes settings of the policy's own sensor.
 
     Raises:
         ConfigError: A policy's own sensor and a changed setting exclude each other.
@@ -86,7 +90,7 @@ def plan_study(config: Config, policies: Sequence[EvaluatedPolicy]) -> Plan:
     ]
     differences = {policy.agent: own_sensor_differences(policy, configured) for policy in policies}
     usual = baselines_of(configured, axes)
-    # Of each group that of its first training.
+    # One environment for each group, with the sensor of its first training.
     envs = {policy.group: with_sensor(configured, policy.sensor) for policy in reversed(policies)}
     baselines = {group: baselines_of(env, axes) for group, env in envs.items()}
     return Plan(
@@ -102,7 +106,7 @@ def plan_study(config: Config, policies: Sequence[EvaluatedPolicy]) -> Plan:
 
 
 def axes_of(scene: str, axes: Mapping[str, Mapping[str, Sequence[Any]]]) -> dict[str, dict[Value, Any]]:
-    """Return the axes of a study; the first is `NOMINAL`, in the scene of the study."""
+    """Return axis -> value -> changed settings; the first axis is `NOMINAL`, with the study's scene."""
     found: dict[str, dict[Value, Any]] = {NOMINAL: {scene: {}}}
     for name, axis in axes.items():
         points = axis_points(axis)
@@ -127,22 +131,23 @@ def _envs(configured: EnvConfig, axes: Axes) -> dict[Condition, EnvConfig]:
 
 
 def same_simulations(configured: EnvConfig, axes: Axes) -> dict[Condition, Condition]:
-    """Return condition -> the first condition that is the same simulation, often itself."""
+    """Return condition -> the first condition with the same simulation, often the condition itself."""
     envs = _envs(configured, axes)
     return {at: next(first for first, other in envs.items() if other == env) for at, env in envs.items()}
 
 
 def same_for_all(found: Sequence[Mapping[Condition, Condition]]) -> dict[Condition, Condition]:
-    """Return condition -> the first one that is the same simulation in each of several `same_simulations`."""
+    """Combine several `same_simulations`: conditions are the same only if they are in all of them."""
     first: dict[tuple[Condition, ...], Condition] = {}
     return {at: first.setdefault(tuple(same[at] for same in found), at) for at in found[0]}
 
 
 def baselines_of(configured: EnvConfig, axes: Axes) -> dict[Condition, Condition]:
-    """Return condition -> the condition it is compared with, to see what the axis itself changes.
+    """Return condition -> its baseline, which isolates the effect of the axis.
 
-    The baseline changes only those settings that stay the same along the axis: for rates in a dense scene,
-    the same scene at the usual rate. If the study has no such condition, the baseline changes nothing.
+    The baseline changes only the settings that are constant along the axis. For control rates in a dense
+    scene, it is the dense scene at the usual rate. If the study lacks such a condition, the baseline is the
+    nominal condition.
     """
     envs = _envs(configured, axes)
     nominal = next(iter(envs))
@@ -167,7 +172,7 @@ def _met(tasks: Sequence[EvaluationTask]) -> frozenset[tuple[Condition, str]]:
 
 
 def was_met(policy: EvaluatedPolicy, nominal: EnvConfig, env: EnvConfig) -> bool:
-    """Whether a condition lies within what a policy's training drew; always False for baselines."""
+    """Whether the condition lies within the policy's training distribution; always False for baselines."""
     if not policy.conditions:
         return False
     trained = with_sensor(EnvConfig(**policy.world), policy.sensor)

@@ -33,16 +33,16 @@ def plan_rows(study: str, trainings: int, corridors: int) -> list[tuple[str, ...
     """Return a row under `HEAD` for each test between groups of several trainings.
 
     Args:
-        study: Name of published data.
-        trainings: Of each group.
-        corridors: In which all are evaluated.
+        study: Name of the published study.
+        trainings: Number for each group.
+        corridors: Number, the same for all groups.
     """
     results, rows = read_published(DATA, study), []
     for family in families_of(read_study(study), results):
         for one in family.contrasts:
             sides = compared_values(one, results, {})
             if one.paired or one.theirs is None or any(side is None or len(side) < 2 for side in sides):
-                continue  # of one training no spread is known
+                continue  # a single training has no spread
             ours, theirs = (spread_of(side) for side in sides if side is not None)
             apart = corridor_spread(*sides)  # type: ignore[arg-type]
             scale, _, unit = scale_of(one)
@@ -54,10 +54,10 @@ def plan_rows(study: str, trainings: int, corridors: int) -> list[tuple[str, ...
 
 
 def several(word: str) -> int:
-    """Return a number of trainings or corridors, of which there must be two.
+    """Parse a number of trainings or corridors, at least two.
 
     Raises:
-        argparse.ArgumentTypeError: It is no such number.
+        argparse.ArgumentTypeError: The word is not such a number.
     """
     if not word.isdecimal() or int(word) < 2:
         raise argparse.ArgumentTypeError(f"must be a whole number, two at least, got {word!r}")
@@ -65,7 +65,7 @@ def several(word: str) -> int:
 
 
 def main(words: Sequence[str]) -> None:
-    """Print the table; wrong words end the program with the rule."""
+    """Print the table; wrong arguments end the program with a message."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     studies = sorted(path.name.removesuffix(ABOUT) for path in DATA.glob(f"*{ABOUT}"))
     parser.add_argument("study", choices=studies, help="whose episodes say how much trainings differ")

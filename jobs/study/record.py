@@ -1,4 +1,4 @@
-"""What a study leaves: plots, tables and every episode in its run folder and the tracker, and crash films."""
+"""Write the results of a study into its run folder and the tracker: plots, tables, episodes, crash films."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -41,7 +41,7 @@ from jobs.tracking.child_runs import ChildRun, write_child_runs
 from jobs.tracking.pages import COLOUR, NOTE, chart_view, table_view
 from jobs.tracking.tracker import Tracker
 
-FILMED = 2  # crashes of a training
+FILMED = 2  # crashes filmed for each group
 CHILD_PARAMS = ("axis", "value", "group")
 CURVES_NOTE = (
     "One group along every axis of numbers: the step of a metric is the axis value. See the parent run."
@@ -51,13 +51,13 @@ TITLE = "Success [%] with 95 % intervals; rows: what is changed, columns: groups
 
 @dataclass(frozen=True)
 class Evaluated:
-    """What was evaluated of a plan.
+    """The results of a plan.
 
     Attributes:
-        plan: What was to be evaluated.
-        store: Where its episodes are kept.
+        plan: The planned evaluation tasks.
+        store: Where their episodes are stored.
         results: Key of a task -> its result.
-        failed: Key of a task -> why it has none.
+        failed: Key of a task -> why it has no result.
     """
 
     plan: Plan
@@ -75,7 +75,7 @@ class Evaluated:
 
     @cached_property
     def cells(self) -> dict[tuple[Condition, str], dict[int | None, np.ndarray]]:
-        """Return condition and group -> training seed -> its episodes, as far as there are any."""
+        """Return condition and group -> training seed -> episodes; no entry where nothing was evaluated."""
         found = {
             at: {
                 task.policy.training: self.results[task.key].episodes
@@ -87,7 +87,7 @@ class Evaluated:
         return {at: own for at, own in found.items() if own}
 
     def event_error(self, task: EvaluationTask) -> dict[str, float]:
-        """Return how exact a task's simulation is, as metrics; empty if that was not measured."""
+        """Return the accuracy of a task's simulation as metrics; empty if it was not measured."""
         accuracy = self.store.accuracy(task)
         values = {} if accuracy is None else asdict(accuracy)
         return {f"sim/{name}": value for name, value in values.items()}
@@ -96,14 +96,14 @@ class Evaluated:
 def record(
     folder: Run, place: Path, tracker: Tracker, found: Evaluated, times: Mapping[str, float]
 ) -> dict[str, float]:
-    """Write plots, tables and tracked runs of a study; return each group's success rate by condition.
+    """Write plots, tables and MLflow runs of a study; return success rates by condition and group.
 
     Args:
         folder: The run folder.
         place: The folder in it that holds the study.
-        tracker: Its MLflow run.
-        found: What was evaluated.
-        times: Variant -> mean minutes of its trainings; empty: none was trained.
+        tracker: The MLflow run of the study.
+        found: The evaluated tasks.
+        times: Variant -> mean minutes of its trainings; empty if none was trained.
     """
     write_cells(place / "episodes.csv", found.cells)
     tracker.artifact(place / "episodes.csv", "sweep")
@@ -119,12 +119,12 @@ def record(
     track_groups(tracker, study)
     track_totals(tracker, found, study)
     facts["episodes_sha256"] = sha256(place / "episodes.csv")
-    write_json(place / "about.json", facts)  # the last: it says that the rest is there
+    write_json(place / "about.json", facts)  # written last: it marks the study as complete
     return {one.name: one.success.value for one in study.summaries}
 
 
 def facts_of(folder: Run, found: Evaluated) -> dict[str, Any]:
-    """Return what made the results: command, commits and date, policies and axes; no path of a machine."""
+    """Return the provenance of the results: command, commits, date, policies, axes; without local paths."""
     plan, config, study = found.plan, folder.config, folder.config.own
     return {
         **provenance(),
@@ -154,7 +154,7 @@ def facts_of(folder: Run, found: Evaluated) -> dict[str, Any]:
 
 
 def _compared(plan: Plan, at: Condition) -> dict[str, Any]:
-    """Return what a condition is compared with, and the first one that is the same simulation."""
+    """Return a condition's baselines and the first condition with the same simulation, as JSON values."""
     usual = plan.baselines[at]
     one = {"condition": texts_of(at), "baseline": texts_of(usual), "same_as": texts_of(plan.same_as[at])}
     own = {group: texts_of(found[at]) for group, found in plan.own_baselines.items() if found[at] != usual}
@@ -162,7 +162,7 @@ def _compared(plan: Plan, at: Condition) -> dict[str, Any]:
 
 
 def _exactness(found: Evaluated) -> list[dict[str, Any]]:
-    """Return how exact each condition was simulated: asked and achieved, as far as it was measured."""
+    """Return the requested and the measured accuracy of each condition whose accuracy was measured."""
     first = {task.condition: task for task in reversed(found.plan.tasks)}
     return [
         {"condition": texts_of(at), "asked": task.env.fidelity.tolerance, **asdict(accuracy)}
@@ -186,7 +186,7 @@ def write_plots(place: Path, study: Study) -> list[Path]:
 
 
 def film_crashes(place: Path, found: Evaluated) -> list[Path]:
-    """Film contacts of each group's first training where nothing is changed; baselines have none."""
+    """Film contacts of each group's first training in the nominal condition; baselines are not filmed."""
     unchanged = [task for task in found.plan.tasks if task.condition[0] == NOMINAL]
     evaluated = [task for task in unchanged if task.key in found.results and task.policy.training is not None]
     first = {task.policy.group: task for task in reversed(evaluated)}
@@ -211,7 +211,7 @@ def typical_crashes(episodes: np.ndarray) -> list[int]:
 def write_tables(
     place: Path, tracker: Tracker, study: Study, found: Evaluated, times: Mapping[str, float]
 ) -> None:
-    """Print, write and track the tables and what the families of tests found."""
+    """Print, write and track the tables and the findings of all families of tests."""
     results, failed = study.results, [task for task in found.plan.tasks if task.key in found.failed]
     gaps = {(task.condition, task.policy.group): "failed" for task in failed}
     head, lines = success_lines(study.summaries, results, results.conditions, gaps)
@@ -241,7 +241,7 @@ def write_tables(
 
 
 def write_all(place: Path, tracker: Tracker, texts: Mapping[str, str]) -> None:
-    """Write texts by their names into the run folder and the tracker."""
+    """Write texts, file name -> text, into the run folder and the tracker."""
     for name, text in texts.items():
         write_atomic(place / name, text)
         tracker.text(f"sweep/{name}", text)
@@ -252,7 +252,7 @@ def _seed_text(task: EvaluationTask) -> str:
 
 
 def condition_run(found: Evaluated, one: Summary) -> ChildRun:
-    """Return the child run of a group under one condition; a tag says what of it could not be evaluated."""
+    """Return the child run of a group under one condition; a tag says why tasks of it failed, if any."""
     axis, value = texts_of(one.condition)
     tasks = found.by_cell[one.condition, one.group]
     seeds = ", ".join("-" if seed is None else str(seed) for seed in one.trainings)
@@ -278,7 +278,7 @@ def condition_run(found: Evaluated, one: Summary) -> ChildRun:
 
 
 def track_groups(tracker: Tracker, study: Study) -> None:
-    """Write a child run for each group, with its curves, and the views that show all children."""
+    """Write a child run with curves for each group, and the views that show all child runs."""
     curves = {name: _curves(study, name) for name in dict.fromkeys(one.group for one in study.summaries)}
     children = [
         ChildRun(name, {"group": name}, {NOTE: CURVES_NOTE, COLOUR: style_of(name)[0]}, {}, own)
@@ -289,7 +289,7 @@ def track_groups(tracker: Tracker, study: Study) -> None:
 
 
 def _curves(study: Study, group: str) -> dict[str, dict[int, float]]:
-    """Return a group's curves along every axis of numbers: metric -> axis value -> its value."""
+    """Return a group's curves along every numeric axis: metric -> axis value -> value of the metric."""
     curves: dict[str, dict[int, float]] = {}
     for axis, points in study.results.axes.items():
         numbers = axis_numbers({text_of(value): changes for value, changes in points.items()})
@@ -300,7 +300,7 @@ def _curves(study: Study, group: str) -> dict[str, dict[int, float]]:
 
 
 def track_totals(tracker: Tracker, found: Evaluated, study: Study) -> None:
-    """Write the totals of a study, and the event errors of its simulations, into its own run."""
+    """Log the totals of a study and the event errors of its simulations to its MLflow run."""
     plan = found.plan
     errors = [error["sim/event_error"] for task in plan.tasks if (error := found.event_error(task))]
     totals = {
@@ -321,7 +321,7 @@ def track_totals(tracker: Tracker, found: Evaluated, study: Study) -> None:
 
 
 def _save_views(tracker: Tracker, curves: Sequence[str]) -> None:
-    """Store what shows a study's children: charts over the axes, and a table of all conditions."""
+    """Save the dashboard views of a study's child runs: charts over the axes, and a table of conditions."""
     below = f"tags.`mlflow.parentRunId` = '{tracker.run_id}' and tags.kind = "
     columns = [
         *(f"metrics.`{name}`" for name in VIEW_COLUMNS),

@@ -1,10 +1,10 @@
 """Copy finished studies, trades and replay pages into docs/ of this folder.
 
 Run: python -m platform.launch +exp=report
-Expect: seconds. Of the newest run of each study that a page in docs has marks of, or of the run folder
-`resume`: its data into docs/data, its figures into docs/images, and the parts between its marks on all pages;
-a study without a page gets docs/NAME.md. Of the newest trade docs/trade.md with its plot, of the newest
-replay page docs/replay.html.
+Expect: seconds. For the newest run of each study that has marks on a page in docs, or for the run folder
+`resume`: data in docs/data, figures in docs/images, and new text between the study's marks on all pages. A
+study without a page gets docs/NAME.md. Also the newest trade as docs/trade.md with its plot, and the newest
+replay page as docs/replay.html.
 """
 
 import dataclasses
@@ -43,9 +43,10 @@ DOCS = Path("docs")
 
 @dataclass(frozen=True, config=STRICT)
 class Settings:
-    """Whether trainings of a study that docs/data has stay beside those of the run.
+    """Whether to add the run's trainings to the published trainings of the study instead of replacing them.
 
-    So a study can be trained on several days or machines, seed by seed: the runs must evaluate alike.
+    This lets a study be trained over several days or on several machines, seed by seed. All runs must be
+    evaluated with the same settings.
     """
 
     keep: bool
@@ -55,13 +56,13 @@ def run(config: Config) -> dict[str, Any]:
     """Write the newest studies, trade and replay page, or those in the run folder `resume`, into docs/.
 
     Raises:
-        ConfigError: There is none, or a study is not complete.
+        ConfigError: There is nothing to write, or a study is incomplete.
     """
     written = [*_copied(config)]
     pages = marked(path.read_text() for path in sorted(DOCS.glob("*.md")))
     named = {name.partition(":")[2] or name for name in pages}
     for name, folder in newest_studies(config).items():
-        if config.resume is not None or name in named or not named:  # elsewhere each gets a page
+        if config.resume is not None or name in named or not named:  # no marks in docs: a page for each
             written.append(write_study(name, folder, config, DOCS))
     if not written:
         where = config.resume or config.runs_dir
@@ -81,7 +82,7 @@ def _newest(found: Collection[Path]) -> Path | None:
 
 
 def newest_studies(config: Config) -> dict[str, Path]:
-    """Return name -> the folder of its newest finished run; of `resume` what it holds."""
+    """Return study -> folder of its newest finished run; only runs in `resume` if it is given."""
     found: dict[str, list[Path]] = {}
     for run_ in _runs(config):
         for file in (run_ / folder / "about.json" for folder in FOLDERS):
@@ -92,20 +93,20 @@ def newest_studies(config: Config) -> dict[str, Path]:
 
 
 def write_study(name: str, folder: Path, config: Config, docs: Path) -> Path:
-    """Publish a study: its data, its figures and the parts of all pages.
+    """Publish a study: its data, its figures and its parts on all pages.
 
     Args:
-        name: Of the study, whose file is conf/exp/NAME.yaml.
-        folder: What it has left in its run folder.
+        name: Name of the study, whose file is conf/exp/NAME.yaml.
+        folder: The study's folder in its run folder.
         config: The experiment; event errors are measured in its simulation.
-        docs: Where pages are, data and figures below.
+        docs: Folder of the pages, with data and figures below.
 
     Returns:
-        The first page that shows it.
+        The first page that shows the study.
 
     Raises:
-        ConfigError: It is not complete, or of an earlier version.
-        RunError: A file of it is damaged.
+        ConfigError: The study is incomplete, or was written by an earlier version.
+        RunError: One of its files is damaged.
     """
     said, data, doses = read_study(name), docs / "data", []
     results = results_of(name, folder, data if config.own.keep else None)
@@ -113,7 +114,7 @@ def write_study(name: str, folder: Path, config: Config, docs: Path) -> Path:
         env = dataclasses.replace(config.env, scene=results.facts["scene"], split="eval")
         doses = measure_doses(said, results, env)
     study = compute(name, said, results, doses, data)
-    drawn = figures(study)  # before anything is replaced: data, figures and pages must stay in step
+    drawn = figures(study)  # an error here must leave data, figures and pages unchanged
     publish(data, name, results)
     if doses:
         write_doses(data / f"{name}_doses.csv", doses)
@@ -133,11 +134,11 @@ def write_study(name: str, folder: Path, config: Config, docs: Path) -> Path:
 
 
 def results_of(name: str, folder: Path, data: Path | None) -> Results:
-    """Read what a study has left in its run folder, beside the trainings that `data` has if that is given.
+    """Read the results of a study from its run folder, joined with the published ones if `data` is given.
 
     Raises:
-        ConfigError: It is not complete, or of an earlier version, or the two do not belong together.
-        RunError: A file of it is damaged.
+        ConfigError: The study is incomplete or from an earlier version, or the two cannot be joined.
+        RunError: One of its files is damaged.
     """
     results = read_results(folder)
     if data is not None:
@@ -150,7 +151,7 @@ def results_of(name: str, folder: Path, data: Path | None) -> Results:
 
 
 def filled_pages(docs: Path) -> dict[str, str]:
-    """Return name -> each page that shows a published study, filled from the data alone."""
+    """Return name -> text of each page that shows a published study, filled from the data alone."""
     texts = {page: page.read_text() for page in sorted(docs.glob("*.md"))}
     return {
         page.name: fill(text, lambda mark, what: part(study_of(docs / "data", mark), what))
@@ -160,7 +161,7 @@ def filled_pages(docs: Path) -> dict[str, str]:
 
 
 def study_of(data: Path, mark: str) -> Study:
-    """Return the published study of a mark, NAME or NAME:DATA."""
+    """Compute the published study of a mark, NAME or NAME:DATA."""
     spec, _, own = mark.partition(":")
     return published(data, own or spec, spec)
 
@@ -173,7 +174,7 @@ def write_values(folder: Path, study: Study) -> None:
 
 
 def write_figures(images: Path, drawn: Mapping[str, Figure]) -> None:
-    """Save figures by their names, packed."""
+    """Save figures under their names as optimized PNG files."""
     images.mkdir(parents=True, exist_ok=True)
     for name, figure in drawn.items():
         picture = images / f"{name}.png"
@@ -182,7 +183,7 @@ def write_figures(images: Path, drawn: Mapping[str, Figure]) -> None:
 
 
 def copy_plot(picture: Path, target: Path) -> None:
-    """Copy a plot, packed as small as it can be without changing a colour.
+    """Copy a plot as an optimized PNG file, without changing a colour.
 
     Raises:
         RunError: The plot is damaged.
@@ -197,7 +198,7 @@ def copy_plot(picture: Path, target: Path) -> None:
 
 
 def _copied(config: Config) -> Iterable[Path]:
-    """Copy the newest trade and the newest replay page; yield what was written."""
+    """Copy the newest trade and the newest replay page; yield the written files."""
     for name, write in (("trade", write_trade), ("replay", write_replay)):
         newest = _newest([file for one in _runs(config) if (file := one / name / "about.json").is_file()])
         if newest is not None:
@@ -208,12 +209,12 @@ def write_trade(trade: Path, docs: Path) -> Path:
     """Copy the page of a trade, its plot and its settings; return the page.
 
     Args:
-        trade: The folder that the job has left in its run folder.
-        docs: Where trade.md goes, its plot into `images`, its settings into `data`.
+        trade: The trade's folder in its run folder.
+        docs: Target folder of trade.md; the plot goes into `images`, the settings into `data`.
     """
     (docs / "images").mkdir(parents=True, exist_ok=True)
     copy_plot(trade / "images" / "trade.png", docs / "images" / "trade.png")
-    if (trade / "settings.csv").is_file():  # trades of earlier versions have none
+    if (trade / "settings.csv").is_file():  # missing in trades of earlier versions
         (docs / "data").mkdir(exist_ok=True)
         write_atomic(docs / "data" / "trade_settings.csv", (trade / "settings.csv").read_text())
     write_atomic(docs / "trade.md", (trade / "trade.md").read_text())
@@ -221,6 +222,6 @@ def write_trade(trade: Path, docs: Path) -> Path:
 
 
 def write_replay(replay: Path, docs: Path) -> Path:
-    """Copy a replay page from the folder that the job has left in its run folder; return the file."""
+    """Copy a replay page from `replay`, its folder in its run folder, into `docs`; return the file."""
     write_atomic(docs / PAGE, (replay / PAGE).read_bytes())
     return docs / PAGE

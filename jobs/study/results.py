@@ -1,4 +1,4 @@
-"""Results of a study: what made it, and its episodes by condition, group and training."""
+"""Results of a study: provenance, and episodes by condition, group and training."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -19,22 +19,22 @@ from jobs.run.checkpoints import sha256
 from jobs.run.files import RunError, read_json, write_json
 
 Value = float | str
-Condition = tuple[str, Value]  # an axis, and its value as a number or a word
+Condition = tuple[str, Value]  # axis and value, a number or a word
 Trainings = Mapping[int | None, np.ndarray]  # training seed -> EPISODE of the same corridors
 Cells = Mapping[tuple[Condition, str], Trainings]  # by condition and group
-FOLDERS = ("study", "sweep", "ablation")  # in a run folder; the last two are of earlier versions
+FOLDERS = ("study", "sweep", "ablation")  # in a run folder; the last two from earlier versions
 RATE = (0.0, 1.0)  # bounds of a rate
-# Facts of two runs that must agree before they are one study, and those that say what made a run.
+# Facts that must agree before two runs are joined into one study, and the provenance of each run.
 EVALUATION = ("exp", "axes", "scene", "split", "trials", "action", "reference", "budget", "env_steps")
 MADE = ("run", "identity", "command", "commit", "date")
 
 
 @dataclass(frozen=True)
 class Results:
-    """All that was found.
+    """All results of a study.
 
     Attributes:
-        facts: What made it, as its about.json says (`jobs.study.record.facts`).
+        facts: Provenance, the content of about.json (`jobs.study.record.facts_of`).
         cells: The episodes.
     """
 
@@ -51,7 +51,7 @@ class Results:
 
     @cached_property
     def conditions(self) -> list[Condition]:
-        """Return all conditions, in their order."""
+        """Return all conditions, axis by axis."""
         return [(axis, value) for axis, points in self.axes.items() for value in points]
 
     @property
@@ -66,16 +66,16 @@ class Results:
 
     @property
     def trained(self) -> list[str]:
-        """Return the groups that are no baselines."""
+        """Return the groups that are not baselines."""
         return [group for group, seeds in self.groups.items() if None not in seeds]
 
     @cached_property
     def same_as(self) -> dict[Condition, Condition]:
-        """Return condition -> the first one that is the same simulation for every group."""
+        """Return condition -> the first condition that is the same simulation for every group."""
         return {place(one["condition"]): place(one["same_as"]) for one in self._compared}
 
     def baselines(self, group: str | None = None) -> dict[Condition, Condition]:
-        """Return condition -> what a group is compared with there; None: what most are."""
+        """Return condition -> the baseline of a group there; None: the baseline of most groups."""
         return {
             place(one["condition"]): place(one.get("own_baseline", {}).get(group or "", one["baseline"]))
             for one in self._compared
@@ -83,21 +83,21 @@ class Results:
 
     @cached_property
     def different(self) -> list[Condition]:
-        """Return every simulation once, the one with nothing changed among them: the first of equal ones."""
+        """Return the first condition of each different simulation, including the nominal condition."""
         return [at for at in self.conditions if self.same_as.get(at, at) == at]
 
     def is_baseline(self, at: Condition, group: str | None = None) -> bool:
-        """Whether a condition is the same simulation as the one that a group is compared with there."""
+        """Whether a condition is the same simulation as the group's baseline there."""
         usual = self.baselines(group).get(at, at)
         return self.same_as.get(at, at) == self.same_as.get(usual, usual)
 
     @property
     def met(self) -> set[tuple[Condition, str]]:
-        """Return the conditions that lie within what a group was trained on, with the group."""
+        """Return the conditions within a group's training distribution, each with that group."""
         return {(place((axis, value)), group) for axis, value, group in self.facts.get("met", ())}
 
     def trainings(self, at: Condition, group: str) -> Trainings:
-        """Return training seed -> its episodes; empty where nothing was evaluated."""
+        """Return training seed -> its episodes; empty if nothing was evaluated."""
         return self.cells.get((at, group), {})
 
     def values(self, at: Condition, group: str, measure: str = "success") -> np.ndarray:
@@ -113,13 +113,13 @@ class Results:
 
 
 def place(names: Sequence[str]) -> Condition:
-    """Return a condition of which a file has axis and value as text."""
+    """Return the condition of an axis and a value given as text, as files store them."""
     axis, text = names
     return axis, value_of(text)
 
 
 def value_of(text: str) -> Value:
-    """Return the value that a text stands for: a finite number, or else the word."""
+    """Parse a value: a finite number, or else the text itself."""
     try:
         number = float(text)
     except ValueError:
@@ -154,10 +154,10 @@ def read_cells(file: Path) -> dict[tuple[Condition, str], dict[int | None, np.nd
 
 
 def read_results(folder: Path) -> Results:
-    """Read what a study has left in its run folder, of earlier versions too.
+    """Read the results of a study from its run folder.
 
     Raises:
-        ConfigError: A version wrote it that did not say what is compared.
+        ConfigError: An early version wrote the folder, without the facts needed for comparisons.
         RunError: A file is damaged.
     """
     facts = read_json(folder / "about.json")
@@ -170,7 +170,7 @@ def read_results(folder: Path) -> Results:
 
 
 def read_published(data: Path, name: str) -> Results:
-    """Read a published study; without `NAME_about.json` groups and conditions are those of its episodes."""
+    """Read a published study; without `NAME_about.json`, take groups and conditions from its episodes."""
     cells, about = read_cells(data / f"{name}_episodes.csv.gz"), data / f"{name}_about.json"
     if about.is_file():
         return Results(read_json(about), cells)
@@ -193,14 +193,14 @@ def write_cells(file: Path, cells: Cells) -> None:
 
 
 def joined(earlier: Results, more: Results) -> Results:
-    """Return the trainings of two runs of a study as the results of one.
+    """Join the trainings of two runs of a study.
 
     Args:
-        earlier: Its facts come first: commands, commits, the order of groups.
-        more: Other trainings in the same corridors under the same conditions.
+        earlier: The earlier run; its groups come first.
+        more: A run with other trainings in the same corridors under the same conditions.
 
     Raises:
-        ConfigError: The runs evaluate otherwise, or have a training in common.
+        ConfigError: The runs were evaluated differently, or have a training in common.
     """
     one, other = earlier.facts, more.facts
     differ = [name for name in EVALUATION if one.get(name) != other.get(name)]
@@ -236,7 +236,7 @@ def joined(earlier: Results, more: Results) -> Results:
 
 
 def _compared_in_both(earlier: Results, more: Results) -> list[dict[str, Any]]:
-    """Return what each condition is compared with, of the groups of two runs, as the facts have it."""
+    """Return the fact `compared` for the groups of both runs: baselines and equal simulations."""
     found = []
     for at in earlier.conditions:
         usual = more.baselines()[at]
@@ -249,7 +249,7 @@ def _compared_in_both(earlier: Results, more: Results) -> list[dict[str, Any]]:
 
 
 def texts_of(at: Condition) -> list[str]:
-    """Return a condition as files have it."""
+    """Return axis and value of a condition as text, as files store them."""
     return [at[0], text_of(at[1])]
 
 
@@ -257,13 +257,13 @@ def publish(data: Path, name: str, results: Results) -> None:
     """Write a study into the published data.
 
     Args:
-        data: Where `NAME_episodes.csv.gz`, `NAME_about.json` and `NAME_trainings.csv` go.
-        name: Of the study.
-        results: What it found.
+        data: Folder for `NAME_episodes.csv.gz`, `NAME_about.json` and `NAME_trainings.csv`.
+        name: Name of the study.
+        results: Its results.
     """
     data.mkdir(parents=True, exist_ok=True)
     write_cells(data / f"{name}_episodes.csv.gz", results.cells)
-    facts = {key: value for key, value in results.facts.items() if key != "host"}  # means nothing to others
+    facts = {key: value for key, value in results.facts.items() if key != "host"}  # a local name
     write_json(data / f"{name}_about.json", facts)
     rows = [
         (axis, text_of(value), group, "" if seed is None else seed, len(own),
@@ -278,7 +278,7 @@ def check_whole(results: Results) -> None:
     """Check that every training has all of its episodes under every condition.
 
     Raises:
-        ConfigError: One has not; the message names it.
+        ConfigError: Episodes are missing; the message names condition, group and seed.
     """
     trials = results.facts["trials"]
     for at in results.conditions:

@@ -12,29 +12,29 @@ from jobs.config.schema import Count, Name
 
 @dataclass(frozen=True, config=STRICT)
 class Settings:
-    """Which policies are trained or taken, under which conditions they are evaluated, and what is asked.
+    """Policies to train or take, conditions to evaluate them under, and tests to make of the results.
 
     Attributes:
-        policies: Policies to evaluate as they are, each a group or a name in models/pretrained, "pretrained"
+        policies: Policies to evaluate as they are: each a group or a name in models/pretrained, "pretrained"
             (all there), "newest", a baseline, or a path.
         scene: The layout, unless an axis changes it.
-        split: Whose corridors: "eval" for results, or "validation" for choosing settings.
+        split: Corridors to fly in: "eval" for results, "validation" for choosing settings.
         trials: Corridors for each training and condition.
-        axes: Name -> setting -> values. The first setting names the points of the axis; others have as many
-            values, or one that stays.
+        axes: Name -> setting -> values. The values of the first setting name the points of the axis. Every
+            other setting has one value per point, or a single value for all.
         reference: The group that paired differences are taken against; null: none.
-        seeds: Of the trainings of each variant.
-        variants: Name -> what it changes, key -> value, with the place in a list as a number. `train.init`
-            names the first variant: its policy of the same seed is trained on. `seeds` gives a variant fewer
-            trainings. Variants whose encoders learn from the same settings share them, seed by seed;
-            `encoder_seed` names one of the seeds: all trainings of the variant see by the encoder of that
-            seed. `tags` are facts for the families, `published` as below.
-        published: Where published policies of a group are, but for "-s0" and so on; VARIANT is the group.
-        train: Whether the variants are trained; false: the published policies are evaluated.
+        seeds: Training seeds of each variant.
+        variants: Name -> changed settings, key -> value; a number in a key is a place in a list.
+            `train.init` must name the first variant: training then continues from its policy with the same
+            seed. `seeds` gives a variant fewer trainings. Variants whose encoders learn from the same
+            settings share these encoders, seed by seed; `encoder_seed` makes all trainings of a variant use
+            the encoder of that one seed. `tags` are facts for the families; `published` as below.
+        published: Path of a group's published policies without "-s0" and so on; VARIANT stands for the group.
+        train: Whether to train the variants; false: evaluate the published policies.
         families: Name -> tests that are corrected together, or a file of conf/claims (jobs/study/spec.py).
         figures: Name -> kind of figure and its settings (jobs/study/figures.py).
-        headline: Axis -> values of the table that readers see first.
-        doses: Axis -> the event errors that its points stand for; null: they are only measured.
+        headline: Axis -> values that the first table on the page shows.
+        doses: Axis -> intended event error of each point; null: event errors are only measured.
         spread: The two random factors that variants and seeds cross; null: none.
     """
 

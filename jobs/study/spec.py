@@ -1,8 +1,9 @@
-"""What a study asks of its results: families of tests, declared in its file, and whom each test compares.
+"""Read the families of tests that a study declares in its file, and find the two sides of each test.
 
-A file of conf/exp has the families below `study.families`; a family that several studies share stands in
-conf/claims and is named. A test compares two sides, or one side with 0. A side is a group, by its name or by
-its tags, under conditions (`at`), less the same under others (`less`).
+A file of conf/exp lists its families under `study.families`. A family that several studies share has a file
+in conf/claims, and is listed by that file's name. A test compares two sides, or one side with 0. A side is a
+group, chosen by name or tags, under conditions (`at`); the group under other conditions (`less`) may be
+subtracted.
 """
 
 import itertools
@@ -19,33 +20,34 @@ from jobs.run.provenance import REPOSITORY
 from jobs.study.results import Condition, Results, value_of
 
 CONF = REPOSITORY / "conf"
-Section = Mapping[str, Any]  # of a study's file, which is data: no class names its keys
-# The smallest difference that matters, unless a family says other. In metres it is what 10 points of success
-# are: over the trainings of ppo_claims and taught_claims a point goes with 0.55 and 0.50 m.
+Section = Mapping[str, Any]  # of a study's file; plain data, no class defines its keys
+# Default of the smallest difference that matters. 5 m correspond to 10 points of success: over the trainings
+# of ppo_claims and taught_claims one point goes with 0.55 and 0.50 m.
 GAIN = {"success": 0.1, "distance_m": 5.0}
 LEARNED = (
     "learned",
     "learned_uncharged",
 )  # measures of learning curves, with and without the encoder's steps
-# How the corridors of two sides are matched: rows of one training seed, or of none.
+# `pair` of a test -> whether its sides are compared training seed by training seed.
 PAIRED = {"seed": True, "none": False}
 KEYS = ("name", "source", "ours", "theirs", "measure", "at", "less", "pair", "for", "contrasts")
 FAMILY = (
     *("title", "adjust", "margin", "words", "power", "beside", "note", "as", "account"),
     *("pairs", "for", "contrasts"),
 )
-PLACE = re.compile(r"<(\w+)>")  # of a value in a test
+PLACE = re.compile(r"<(\w+)>")  # placeholder for a value in a test
 WORDS = ("above", "below", "within", "no_gain", "no_loss")  # verdicts that a family can name
 ACCOUNTS = ("planned", "other")
 
 
 class Side(NamedTuple):
-    """What one side of a test averages.
+    """One side of a test: a group's mean over conditions.
 
     Attributes:
-        group: What was trained.
-        at: Conditions, of which the mean is taken.
-        less: Conditions, of which the mean is subtracted; as many as `at`: one by one.
+        group: The group.
+        at: Conditions to average over.
+        less: Conditions whose mean is subtracted. If there are as many as in `at`, they are subtracted one
+            by one.
     """
 
     group: str
@@ -57,11 +59,11 @@ class Contrast(NamedTuple):
     """One test.
 
     Attributes:
-        name: What is asked.
-        source: Who says so, or "".
-        ours, theirs: Both sides; `theirs` is None where `ours` is compared with 0.
+        name: The question, in words.
+        source: Where the claim comes from, or "".
+        ours, theirs: Both sides; `theirs` is None if `ours` is compared with 0.
         measure: A column of EPISODE, or one of `LEARNED`.
-        paired: Whether trainings of one seed are compared.
+        paired: Whether trainings with the same seed are compared pairwise.
     """
 
     name: str
@@ -73,7 +75,7 @@ class Contrast(NamedTuple):
 
     @property
     def against(self) -> str:
-        """Return the group of the other side; "" for a test about one group."""
+        """Return the group of the other side; "" if the test involves a single group."""
         return "" if self.theirs is None or self.theirs.group == self.ours.group else self.theirs.group
 
 
@@ -81,17 +83,17 @@ class Family(NamedTuple):
     """Tests that are corrected together.
 
     Attributes:
-        name: In the file.
-        title: On the page.
+        name: Name in the file.
+        title: Heading on the page.
         contrasts: The tests, or estimates if `adjust` is "none".
-        adjust: "holm", "bh" or "none".
+        adjust: Correction of the p values: "holm", "bh" or "none".
         margin: Measure -> the smallest difference that matters.
-        words: Of `WORDS` -> how the family calls that verdict.
-        power: Whether undecided tests say how many trainings would decide them.
-        beside: Heading -> study whose findings on the same tests are shown, in its family of the same name;
-            or STUDY:FAMILY.
-        note: What a reader must know of the table.
-        alias: Group of this study -> the name that the tests have for it.
+        words: Verdict in `WORDS` -> the family's word for it.
+        power: Whether to report how many trainings would decide an undecided test.
+        beside: Column heading -> STUDY or STUDY:FAMILY whose findings on the same tests fill that column;
+            without FAMILY, its family of the same name.
+        note: Text that explains the table.
+        alias: Group of this study -> its name in the tests.
     """
 
     name: str
@@ -107,19 +109,19 @@ class Family(NamedTuple):
 
 
 def read_study(name: str, conf: Path = CONF) -> dict[str, Any]:
-    """Read the section `study` of an experiment's file; empty if there is no such file."""
+    """Read the section `study` of conf/exp/NAME.yaml; empty if there is no such file."""
     file = conf / "exp" / f"{name}.yaml"
     found = yaml.safe_load(file.read_text()) if file.is_file() else None
     return dict((found or {}).get("study") or {})
 
 
 def families_of(study: Section, results: Results, conf: Path = CONF) -> list[Family]:
-    """Return the families of a study whose sides its results have.
+    """Return the families of a study, without tests of groups that its results lack.
 
     Args:
         study: Section `study` of its file.
-        results: What was found.
-        conf: Where shared families are.
+        results: The study's results.
+        conf: Folder with the shared families in `claims`.
 
     Raises:
         ConfigError: A family has a wrong key or value.
@@ -133,7 +135,7 @@ def families_of(study: Section, results: Results, conf: Path = CONF) -> list[Fam
 
 
 def tags_of(study: Section, results: Results) -> dict[str, dict[str, Any]]:
-    """Return group -> its tags, of which its name is one."""
+    """Return group -> its tags; the tag `group` is its name."""
     variants = study.get("variants") or {}
     return {
         group: {**(variants.get(group) or {}).get("tags", {}), "group": group} for group in results.groups
@@ -141,7 +143,7 @@ def tags_of(study: Section, results: Results) -> dict[str, dict[str, Any]]:
 
 
 def _shared(name: str, said: object, conf: Path) -> dict[str, Any]:
-    """Return a family, with what it has from a file of conf/claims, which may use another."""
+    """Return a family merged with the file of conf/claims that it uses, which may use another one."""
     own = {"use": said} if isinstance(said, str) else dict(said) if isinstance(said, Mapping) else None
     if own is None:
         raise ConfigError(f"study.families.{name}: must be a family or a file of conf/claims, got {said!r}")
@@ -199,10 +201,10 @@ def _expand(block: Section, values: Section, results: Results) -> Iterator[dict[
 
 
 def other_account(said: Section) -> dict[str, Any] | None:
-    """Return a test by its other account; None if it has no other.
+    """Return the same test under the other way of accounting; None if there is no other.
 
-    A change from the baseline becomes success or distance as they are. Speed of learning no longer counts the
-    steps that were recorded for the encoder.
+    A test of a change from the baseline becomes a test of success or distance themselves. A test of learning
+    speed no longer charges the steps recorded for the encoder.
     """
     if said.get("less") == "baseline":
         return {key: value for key, value in said.items() if key != "less"}
@@ -210,7 +212,7 @@ def other_account(said: Section) -> dict[str, Any] | None:
 
 
 def _loop(value: object, values: Section, results: Results) -> Sequence[Any]:
-    """Return the values of a loop: a list, the trained groups, or those after the first."""
+    """Return the values of a loop: a list, all trained groups, or all but the first."""
     if value == "groups":
         return results.trained
     if value == "others":
@@ -222,7 +224,7 @@ def _loop(value: object, values: Section, results: Results) -> Sequence[Any]:
 
 
 def _filled(value: Any, values: Section) -> Any:
-    """Return a part of a file with each `<name>` replaced by its value."""
+    """Return part of a file with each `<name>` replaced by its value."""
     if isinstance(value, Mapping):
         return {_filled(key, values): _filled(one, values) for key, one in value.items()}
     if isinstance(value, list):
@@ -233,7 +235,7 @@ def _filled(value: Any, values: Section) -> Any:
 
 
 def _contrast(family: str, said: Section, tags: Mapping[str, Section], results: Results) -> Contrast | None:
-    """Return a test; None where the study lacks one of its groups."""
+    """Return a test; None if the study lacks one of its groups."""
     wrong = [key for key in said if key not in KEYS]
     if wrong or "ours" not in said:
         raise ConfigError(
@@ -261,7 +263,7 @@ def _side(said: Section, key: str, tags: Mapping[str, Section], results: Results
     (group,) = found
     at = _conditions(side.get("at", said.get("at", "all")), group, results)
     less = side.get("less", said.get("less"))
-    if less == "baseline":  # a condition that is its own baseline changes nothing
+    if less == "baseline":  # leave out conditions that are their own baseline
         at = tuple(one for one in at if not results.is_baseline(one, group))
         usual = results.baselines(group)
         return Side(group, at, tuple(usual.get(one, one) for one in at))
@@ -271,7 +273,7 @@ def _side(said: Section, key: str, tags: Mapping[str, Section], results: Results
 
 
 def _conditions(said: object, group: str, results: Results) -> tuple[Condition, ...]:
-    """Return conditions by their axes and values, those that the study lacks left out."""
+    """Return the conditions with these axes and values, without any that the study lacks."""
     every = results.conditions
     if said == "all":
         return tuple(results.different)
@@ -290,7 +292,7 @@ def _conditions(said: object, group: str, results: Results) -> tuple[Condition, 
 
 
 def _all_pairs(said: Section, results: Results) -> list[Contrast]:
-    """Return a test for each pair of groups of several trainings, over the same conditions."""
+    """Return a test for each pair of groups with several trainings, over the same conditions."""
     every = _conditions(said.get("at", "all"), "", results)
     groups = [group for group in results.trained if any((at, group) in results.cells for at in every)]
     shared = tuple(at for at in every if all((at, group) in results.cells for group in groups))

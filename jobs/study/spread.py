@@ -1,4 +1,4 @@
-"""By which of two crossed random factors trainings differ: encoder and seed of PPO, for example."""
+"""Split the spread between trainings into two crossed random factors, such as encoder and PPO seed."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -9,16 +9,17 @@ from jobs.analysis.statistics import CONFIDENCE, CrossedSpread, crossed_spread, 
 from jobs.study.results import Condition, Results, values_of
 from jobs.study.spec import tags_of
 
-SEED = "seed"  # a tag with this value is the training's own seed
+SEED = "seed"  # value of the tag that stands for the training's own seed
 
 
 class Factors(NamedTuple):
-    """What the trainings of a table differ by.
+    """Spread of the trainings in a table by row and by column.
 
     Attributes:
-        mean: Success of all [%].
+        mean: Mean success of all trainings [%].
         spread: Standard deviations [points].
-        rows_p, columns_p: Of the tests that these are 0, after Holm; None: not tested.
+        rows_p, columns_p: p values (Holm) of the tests that the row or column deviation is 0; None: not
+            tested.
     """
 
     mean: float
@@ -33,11 +34,12 @@ class Factors(NamedTuple):
 
 
 def crossed_tables(study: Mapping[str, Any], results: Results) -> dict[Condition, np.ndarray]:
-    """Return the success rate of each training, 0..1, (rows, columns), under each condition.
+    """Return condition -> success rate of each training, 0..1, (rows, columns).
 
     Args:
-        study: Section `study` of its file; `spread.tag` names the tag of the row; the column is the seed.
-        results: What was evaluated.
+        study: Section `study` of its file. `spread.tag` names the tag that gives the row; the column is the
+            seed.
+        results: The results of the study.
 
     Raises:
         ValueError: A training is missing.
@@ -61,7 +63,7 @@ def _table(cells: Mapping[tuple[int, int], float]) -> np.ndarray:
 
 
 def factors(tables: Mapping[Condition, np.ndarray]) -> tuple[Factors, dict[Condition, Factors]]:
-    """Return the factors of the mean of all conditions, one family of tests, and of each, another family."""
+    """Return the factors of the mean over all conditions, and of each condition: two families of tests."""
     mean: Condition = ("", "")
     overall = _family({mean: np.mean(list(tables.values()), axis=0)})[mean]
     return overall, _family(tables)

@@ -3,9 +3,9 @@
 Run: python -m platform.launch +exp=robustness
 Expect: about half a second of one core for each episode (7 for each training and condition). In the run
 folder under `study/`: a figure for each axis, tables with intervals, and every episode. All policies fly
-through the same corridors. Each training of a variant has a run folder of its own, and is read from it once
-it is finished. A stopped study continues when the same command is given again: stored episodes are read
-back, failed ones are tried again (`jobs.rollout.scheduler`).
+through the same corridors. Each training of a variant has its own run folder, and a finished training is not
+repeated. To resume a stopped study, run the same command again: stored episodes are read back, failed ones
+are tried again (`jobs.rollout.scheduler`).
 """
 
 import dataclasses
@@ -31,7 +31,7 @@ __all__ = ["Settings", "run"]
 
 
 def run(config: Config, executor: Executor | None = None) -> dict[str, float]:
-    """Train and evaluate what is missing, and report; return each group's success rate by condition.
+    """Train and evaluate what is missing, write the results, return success rates by group and condition.
 
     Args:
         config: The experiment.
@@ -68,7 +68,10 @@ def evaluate(
     times: dict[str, float],
     executor: Executor | None,
 ) -> dict[str, float]:
-    """Evaluate all policies in the same corridors, and report; `times` [min] may be empty."""
+    """Evaluate all policies in the same corridors, and write the results.
+
+    `times` maps a variant to the mean minutes of its trainings; it may be empty.
+    """
     config = folder.config
     plan = plan_study(config, policies)
     announce(plan)
@@ -77,8 +80,8 @@ def evaluate(
     )
     store, executor = EpisodeStore(place), executor or default_executor(config.cluster, place)
     planned = Evaluated(plan, store, {}, {})
-    families_of(dataclasses.asdict(config.own), Results(facts_of(folder, planned), {}))  # refuses first
-    kind = "ablation" if config.own.variants else "sweep"  # as earlier versions tag their runs
+    families_of(dataclasses.asdict(config.own), Results(facts_of(folder, planned), {}))  # find errors early
+    kind = "ablation" if config.own.variants else "sweep"  # tags of earlier versions
     with open_tracker(config, folder, key=f"{kind} {plan.identity[:8]}") as tracker:
         tracker.tags({"kind": kind, "groups": ", ".join(plan.groups)})
         found = Evaluated(plan, store, *evaluate_tasks(plan.tasks, store, executor, "Study"))
@@ -88,7 +91,7 @@ def evaluate(
 
 
 def announce(plan: Plan) -> None:
-    """Print what is evaluated, and where a policy's own sensor replaces the configured one."""
+    """Print the groups to evaluate, and where a policy's own sensor differs from the configured one."""
     for group, trainings in plan.groups.items():
         seeds = ", ".join(str(seed) for seed in trainings if seed is not None)
         console.print(f"Group: {group}" + (f" (training seeds {seeds})" if seeds else ""), markup=False)

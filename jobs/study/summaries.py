@@ -1,4 +1,4 @@
-"""What the trainings of a group achieved under a condition: estimates, and their metrics for the tracker."""
+"""Summarise the trainings of a group under a condition: estimates, and their metrics for the tracker."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -9,7 +9,7 @@ from jobs.analysis.tables import estimate_metrics, estimate_text, events_texts, 
 from jobs.study.contrasts import reach
 from jobs.study.results import RATE, Condition, Results, Trainings, text_of, values_of
 
-MET = "°"  # behind a result whose condition lies within what the group was trained on
+MET = "°"  # marks a result whose condition lies within the group's training distribution
 
 
 @dataclass(frozen=True)
@@ -18,15 +18,16 @@ class Summary:
 
     Attributes:
         condition: The condition.
-        group: What was trained.
-        trainings: Training seeds that were evaluated; a baseline has None.
-        episodes: Of all of them [-].
-        success: Fraction that reached the goal.
+        group: The group.
+        trainings: Training seeds that were evaluated; None for a baseline.
+        episodes: Number of episodes of all trainings [-].
+        success: Fraction of episodes that reached the goal.
         distance_m: Mean forward distance without collision [m].
-        success_difference: To the reference group in the same corridors; None: there is none.
-        distance_difference_m: The same of the distance [m].
+        success_difference: Difference of success to the reference group in the same corridors; None: there
+            is no reference.
+        distance_difference_m: Difference of distance to the reference group [m].
         events_per_step: Mean events of a control step [-]; 0 for an agent that sees none.
-        dropped: Events that did not fit into a window or a pixel, all episodes [-].
+        dropped: Events in all episodes that did not fit into a window or a pixel [-].
     """
 
     condition: Condition
@@ -51,9 +52,9 @@ def summarise(at: Condition, group: str, trainings: Trainings, reference: Traini
 
     Args:
         at: The condition.
-        group: What was trained.
-        trainings: EPISODE (n,) of each training, of the same corridors.
-        reference: The same of the group to compare with.
+        group: The group.
+        trainings: EPISODE (n,) of each training, in the same corridors.
+        reference: EPISODE (n,) of each training of the reference group.
     """
     success, distance = values_of(trainings, "success"), values_of(trainings, "distance_m")
     differences: list[Difference | None] = [None, None]
@@ -78,7 +79,7 @@ def summarise(at: Condition, group: str, trainings: Trainings, reference: Traini
 
 
 def summaries_of(results: Results) -> list[Summary]:
-    """Summarise all groups under all conditions under which they were evaluated."""
+    """Summarise every group under every condition in which it was evaluated."""
     reference = str(results.facts.get("reference"))
     return [
         summarise(at, group, results.cells[at, group],
@@ -95,13 +96,13 @@ def success_lines(
     conditions: Sequence[Condition],
     gaps: Mapping[tuple[Condition, str], str] | None = None,
 ) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Return headings and lines of success [%] with intervals: a line each condition, a column each group.
+    """Return headings and lines of success [%] with intervals: a line per condition, a column per group.
 
     Args:
-        found: What was evaluated.
-        results: Whose groups.
-        conditions: Which are shown.
-        gaps: Condition and group -> what stands in an empty place; by default "-".
+        found: Summaries of the evaluated groups.
+        results: The study, which determines the groups.
+        conditions: The conditions to show.
+        gaps: Condition and group -> text of an empty cell; by default "-".
     """
     cells = dict(gaps or {})
     for one in found:
@@ -137,7 +138,7 @@ def details_table(found: Sequence[Summary], reference: str) -> str:
 
 
 def metrics_of(one: Summary) -> dict[str, float]:
-    """Return a summary as metrics; what is not known is left out."""
+    """Return a summary as metrics, without unknown ones."""
     metrics = {
         **estimate_metrics("eval/success_rate", one.success),
         **estimate_metrics("eval/distance_m", one.distance_m),
@@ -151,7 +152,7 @@ def metrics_of(one: Summary) -> dict[str, float]:
 
 
 def columns_of(found: Sequence[Summary]) -> dict[str, list[str | float]]:
-    """Return the summaries as columns of a tracker's table; the first, condition and group, is unique."""
+    """Return the summaries as columns of a tracker's table; the first (condition and group) is unique."""
     metrics = [metrics_of(one) for one in found]
     names = dict.fromkeys(name for values in metrics for name in values)
     return {
@@ -166,16 +167,16 @@ def columns_of(found: Sequence[Summary]) -> dict[str, list[str | float]]:
 
 
 def axis_curves(axis: str, numbers: Sequence[float], found: Sequence[Summary]) -> dict[str, dict[int, float]]:
-    """Return success and distance of a group along an axis, as curves of a tracker, whose steps are integers.
+    """Return success and distance of a group along an axis as curves of a tracker, whose steps are integers.
 
     Args:
-        axis: Its name.
-        numbers: Its values.
-        found: Of this axis and one group.
+        axis: Name of the axis.
+        numbers: Values of the axis.
+        found: Summaries of one group along this axis.
 
     Returns:
-        Metric -> step -> value. The step is the axis value, in per cent or per mille where it must be to be
-        whole, which the metric's name then says; no curve if even these are not.
+        Metric -> step -> value. The step is the axis value; if it is not an integer, the value in per cent or
+        per mille, named in the metric. Empty if none of these gives integers.
     """
     for scale, unit in ((1, ""), (100, "_percent"), (1000, "_permille")):
         if all(math.isclose(round(scale * number), scale * number) for number in numbers):

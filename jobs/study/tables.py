@@ -1,4 +1,4 @@
-"""The tables and sentences of a study's page, each by one rule for all studies."""
+"""Tables and sentences of a study's page, by the same rules for all studies."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -34,11 +34,11 @@ TESTS = (
     *("family", "Group", "test", "against", "condition", "verdict", "certain_in_family"),
     *("difference", "difference_low", "difference_high", "unit", "p_adjusted", "trainings_needed"),
 )
-WORST = 3  # conditions that break most are named, and what ties with them
+WORST = 3  # number of worst conditions that a sentence names, plus ties
 
 
 def scale_of(contrast: Contrast) -> tuple[float, str, str]:
-    """Return factor, format and unit in which a test's value is shown."""
+    """Return factor, format and unit for showing a test's value."""
     if contrast.measure not in ("success", *LEARNED):
         return 1, "+.1f", "m"
     return (100, "+.0f", "points") if contrast.theirs or contrast.ours.less else (100, ".0f", "%")
@@ -53,14 +53,14 @@ def value_text(finding: Finding) -> str:
 def family_table(
     family: Family, findings: Sequence[Finding], beside: Mapping[str, Mapping[tuple[str, ...], str]]
 ) -> str:
-    """Return the tests of a family as a Markdown table: a line each, or a line for each group.
+    """Return the tests of a family as a Markdown table: a line per test, or per group if possible.
 
-    Groups that all pass the same tests, each alone or against one other group, have a line each.
+    A line per group is possible if all groups have the same tests, alone or against one common group.
 
     Args:
         family: The family.
-        findings: Of its tests.
-        beside: Heading -> `key_of` a test -> what another family found.
+        findings: Findings of its tests.
+        beside: Heading -> `key_of` a test -> finding of another family.
     """
     names = list(dict.fromkeys(one.contrast.name for one in findings))
     groups = list(dict.fromkeys(one.contrast.ours.group for one in findings))
@@ -80,7 +80,7 @@ def family_table(
 def _columns_beside(
     family: Family, findings: Sequence[Finding], beside: Mapping[str, Mapping[tuple[str, ...], str]]
 ) -> dict[str, list[str]]:
-    """Return heading -> a text for each test: what was found, and what other families found of the same."""
+    """Return heading -> a text for each test: its finding, and the findings of other families."""
     usual = Counter(one.contrast.against for one in findings).most_common(1)[0][0]
     return {
         "Group": [f"`{one.contrast.ours.group}`" for one in findings],
@@ -95,7 +95,7 @@ def _columns_beside(
 
 
 def _columns(family: Family, findings: Sequence[Finding]) -> dict[str, list[str]]:
-    """Return heading -> a text for each test; none of a heading of which a family has nothing."""
+    """Return heading -> a text for each test; an empty list if the family has no such column."""
     tested = family.adjust != "none"
     return {
         "Group": [f"`{one.contrast.ours.group}`" for one in findings],
@@ -110,12 +110,12 @@ def _columns(family: Family, findings: Sequence[Finding]) -> dict[str, list[str]
 
 
 def finding_text(one: Finding) -> str:
-    """Return the verdict of a test; bold: what is certain in its family."""
+    """Return the verdict of a test, with the words in bold that are certain in its family."""
     return ", ".join(f"**{word}**" if certain else word for word, certain in _certainty(one).items())
 
 
 def _certainty(one: Finding) -> Mapping[str, bool]:
-    """Return the words of a verdict, and whether each is certain in the family."""
+    """Return word of the verdict -> whether it is certain in the family."""
     if one.excluded and one.verdict == ", ".join(one.excluded):
         return one.excluded
     return {one.verdict: one.adjusted_p is not None and one.adjusted_p < 1 - CONFIDENCE}
@@ -141,19 +141,19 @@ def _needed_text(one: Finding) -> str:
 
 
 def key_of(family: Family, contrast: Contrast) -> tuple[str, ...]:
-    """Return what a test asks, by the names that a shared family has for its groups."""
+    """Return name and groups of a test, which identify it across studies; groups by the family's aliases."""
     sides = (contrast.ours.group, "" if contrast.theirs is None else contrast.theirs.group)
     return contrast.name, *(family.alias.get(group, group) for group in sides)
 
 
 def counted(findings: Sequence[Finding]) -> str:
-    """Return how many findings have each verdict, the most frequent first."""
+    """Return the number of findings with each verdict as text, the most frequent first."""
     verdicts = Counter(one.verdict for one in findings)
     return "; ".join(f"{count} {verdict}" for verdict, count in verdicts.most_common())
 
 
 def _excluded_text(family: Family, findings: Sequence[Finding]) -> str:
-    """Return how many tests exclude a gain, and how many a loss; "" if the family does not ask."""
+    """Return a sentence with the numbers of tests that exclude a gain or a loss; "" if not asked."""
     said = []
     for name, what in (("no_gain", "gain"), ("no_loss", "loss")):
         if name in family.words:
@@ -164,14 +164,14 @@ def _excluded_text(family: Family, findings: Sequence[Finding]) -> str:
 
 
 def limit_text(family: Family, findings: Sequence[Finding]) -> str:
-    """Return the smallest differences that matter, in each unit of the tests."""
+    """Return the smallest differences that matter as text, in each unit of the tests."""
     measures = {one.contrast.measure for one in findings}
     margins = [f"{100 * family.margin['success']:g} points"] if measures & {"success", *LEARNED} else []
     return " or ".join(margins + ([f"{family.margin['distance_m']:g} m"] if "distance_m" in measures else []))
 
 
 def family_sentence(family: Family, findings: Sequence[Finding]) -> str:
-    """Return what a family of tests found: its one test, or the counts and the tests that are certain."""
+    """Return the findings of a family in a sentence: its only test, or counts and the certain tests."""
     if family.adjust == "none" or not findings:
         return ""
     if len(findings) == 1:
@@ -191,12 +191,12 @@ def family_sentence(family: Family, findings: Sequence[Finding]) -> str:
 
 
 def _test_text(contrast: Contrast, usual: str = "") -> str:
-    """Return the name of a test, and the other side unless that is the usual one."""
+    """Return the name of a test, with the other group unless it is the usual one."""
     return contrast.name + ("" if contrast.against == usual else f" (against `{contrast.against}`)")
 
 
 def family_note(family: Family, findings: Sequence[Finding]) -> str:
-    """Return how the verdicts of a family are to be read."""
+    """Return the note that explains the verdicts of a family."""
     if family.adjust == "none":
         return family.note or "Means with 95 % intervals over trainings and corridors, each alone."
     words = family.words
@@ -221,7 +221,7 @@ def family_note(family: Family, findings: Sequence[Finding]) -> str:
 
 
 def lead_sentence(results: Results, findings: Sequence[Finding]) -> str:
-    """Return which group succeeds most over all conditions, its worst one, and how sure its lead is."""
+    """Return a sentence on the group with the highest success: its worst condition, and its certain leads."""
     at = [one for one in results.different if all((one, g) in results.cells for g in results.trained)]
     if not at:
         return ""
@@ -242,7 +242,7 @@ def lead_sentence(results: Results, findings: Sequence[Finding]) -> str:
 
 
 def worst_sentence(results: Results, changes: Sequence[Change]) -> str:
-    """Return under which conditions most trainings lose half of their success or more."""
+    """Return a sentence on the conditions under which most trainings lose at least half of their success."""
     if not changes:
         return ""
     every = sum(len(results.groups[group]) for group in {change.group for change in changes})
@@ -269,7 +269,7 @@ def _against(at: Condition, baseline: Condition) -> str:
 
 
 def losses_table(results: Results, changes: Sequence[Change]) -> str:
-    """Return what certainly takes success from trainings, for each group its worst condition first."""
+    """Return a line per group: nominal success, largest drop, and its certain losses, the worst first."""
     lines = []
     for group in results.trained:
         own = [change for change in changes if change.group == group]
@@ -287,7 +287,7 @@ def losses_table(results: Results, changes: Sequence[Change]) -> str:
 
 
 def certain_losses_table(results: Results, changes: Sequence[Change]) -> str:
-    """Return for each group the losses that are certain for other trainings, the largest first."""
+    """Return a line per group with the losses that are certain for other trainings, the largest first."""
     lines = []
     for group in results.trained:
         own = sorted((one for one in changes if one.group == group), key=lambda one: one.difference.value)
@@ -312,7 +312,7 @@ def _loss_text(change: Change) -> str:
 
 
 def broken_table(changes: Sequence[Change]) -> str:
-    """Return how many of a group's trainings certainly lose, over all points of an axis."""
+    """Return a table, groups by axes: certain losses among all trainings at all points of the axis."""
     groups, axes = (list(dict.fromkeys(names)) for names in
                     zip(*((one.group, one.condition[0]) for one in changes), strict=True))  # fmt: skip
 
@@ -326,7 +326,7 @@ def broken_table(changes: Sequence[Change]) -> str:
 
 
 def change_table(changes: Sequence[Change], doses: Sequence[Dose]) -> str:
-    """Return the change of success [points] at every dose of wrong events, a column for each group."""
+    """Return the change of success [points] at each dose of event errors, a column per group."""
     found = {(one.condition, one.group): one for one in changes}
     groups = list(dict.fromkeys(one.group for one in changes))
 
@@ -350,7 +350,7 @@ def change_table(changes: Sequence[Change], doses: Sequence[Dose]) -> str:
 
 
 def condition_table(rows: Sequence[Row], contrast: Contrast, mean: Finding, results: Results) -> str:
-    """Return both sides of a test under each of its conditions, the mean of all first."""
+    """Return both sides of a test under each of its conditions; the first line is the mean."""
     ours, theirs = contrast.ours.group, contrast.theirs.group if contrast.theirs else ""
     at = contrast.ours.at
     every = [np.mean([results.values(one, group) for one in at], axis=0) for group in (theirs, ours)]
@@ -367,7 +367,7 @@ def condition_table(rows: Sequence[Row], contrast: Contrast, mean: Finding, resu
 
 
 def spread_table(overall: Factors, each: Mapping[Condition, Factors], names: tuple[str, str]) -> str:
-    """Return the standard deviations of two crossed factors, of the mean of all conditions and of each."""
+    """Return the standard deviations by two crossed factors, for the mean of all conditions and for each."""
     lines = []
     for name, one in [("mean of these", overall), *((condition_text(at), one) for at, one in each.items())]:
         p_values = ["-" if p is None else f"{p:.2g}" for p in (one.rows_p, one.columns_p)]
@@ -387,7 +387,13 @@ def spread_table(overall: Factors, each: Mapping[Condition, Factors], names: tup
 
 
 def spread_sentence(overall: Factors, names: tuple[str, str], mean: np.ndarray) -> str:
-    """Return by which factor trainings certainly differ; `mean` is the success 0..1 (rows, columns)."""
+    """Return a sentence on the factors by which trainings certainly differ.
+
+    Args:
+        overall: Factors of the mean over all conditions.
+        names: Names of the row and the column factor.
+        mean: Success rate of each training, 0..1, (rows, columns).
+    """
     certain = overall.certain(names)
     said = (
         f"differ by their {' and '.join(certain)}"
@@ -406,7 +412,7 @@ def spread_sentence(overall: Factors, names: tuple[str, str], mean: np.ndarray) 
 
 
 def errors_table(results: Results) -> str:
-    """Return how exact the events of each condition were; "" if that was not measured."""
+    """Return the requested and the measured event error of each condition; "" if not measured."""
     lines = [
         (condition_text(place(one["condition"])), f"{100 * one['asked']:g}",
          f"{100 * one['event_error']:.1f}", f"{one['renders_per_step']:.1f}")
@@ -452,7 +458,7 @@ def write_changes(file: Path, changes: Sequence[Change]) -> None:
 def write_tests(
     file: Path, families: Mapping[str, tuple[Family, Sequence[Finding]]], results: Results
 ) -> None:
-    """Write every test as CSV; of a family of one test also its conditions, which are not tested."""
+    """Write every test as CSV. A family with a single test also lists its conditions, without p values."""
     rows = []
     for name, (family, findings) in families.items():
         rows += [(name, *_test_cells(family, one)) for one in findings]

@@ -1,4 +1,4 @@
-"""The trainings of a study: each variant with each seed, trained in a run folder of its own or published."""
+"""Trainings of a study: each variant with each seed, trained in its own run folder or already published."""
 
 import dataclasses
 import itertools
@@ -24,14 +24,14 @@ ENCODER_FILES = (
     "stages/collect.json",
     "stages/pretrain.json",
 )
-# Settings that change nothing an encoder learns from: variants that differ in these alone share encoders.
+# Settings that do not affect what an encoder learns from. Variants that differ only in these share encoders.
 SAME_ENCODER = (
     *("train.", "algo.", "model.memory_ms", "model.stack", "model.hidden"),
     *("model.own_actions", "model.own_velocity"),
 )
 INIT = "train.init"
-STATED = ("algo", "train", "collect", "pretrain")  # sections that a manifest states, beside the model's
-# Keys of a variant that are no settings of its experiment.
+STATED = ("algo", "train", "collect", "pretrain")  # sections in a manifest, besides the model's
+# Keys of a variant that are not settings of its experiment.
 SEEDS, ENCODER_SEED = "seeds", "encoder_seed"
 APART = (SEEDS, ENCODER_SEED, "tags", "published")
 Training = tuple[str, int]  # variant and seed
@@ -41,7 +41,7 @@ def check_variants(config: Config) -> None:
     """Check every variant before anything is trained.
 
     Raises:
-        ConfigError: One has a wrong key or value.
+        ConfigError: A variant has a wrong key or value.
     """
     for name in config.own.variants:
         seed = seeds_of(config, name)[0]
@@ -53,7 +53,7 @@ def published_policies(config: Config) -> dict[Training, Path]:
     """Return the published policy folder of every training of a study.
 
     Raises:
-        ConfigError: A training is missing, or its manifest says that it was trained otherwise.
+        ConfigError: A training is missing, or its manifest says that it used other settings.
     """
     said, found, wrong = {**dataclasses.asdict(config.own)}, {}, []
     for name, seed in trainings_of(config):
@@ -75,7 +75,7 @@ def published_policies(config: Config) -> dict[Training, Path]:
 
 
 def _stated_otherwise(folder: Path, training: Config) -> str:
-    """Return how a published policy was trained otherwise than a configuration says; "" if it was not."""
+    """Return how a published policy's training differs from a configuration; "" if it does not."""
     if not (folder / MANIFEST).is_file():
         return "is not there"
     manifest = read_policy_manifest(folder / MANIFEST)
@@ -89,7 +89,7 @@ def _stated_otherwise(folder: Path, training: Config) -> str:
 
 
 def stated(settings: Mapping[str, object]) -> dict[str, object]:
-    """Return what a manifest states of its policy's training, or the same of a configuration."""
+    """Return the training settings that a manifest or a configuration states: key -> value."""
     sections = {name: cast(dict[str, object], settings.get(name, {})) for name in (*STATED, "model")}
     model = sections.pop("model") or {name: settings[name] for name in model_keys() if name in settings}
     parts = {f"{name}.{key}": value for name, own in sections.items() for key, value in own.items()}
@@ -103,7 +103,7 @@ def trainings_of(config: Config) -> list[Training]:
 
 
 def train_variants(config: Config) -> dict[Training, Run]:
-    """Train every variant with every seed unless that is done; return the runs."""
+    """Train every variant with every seed, without repeating finished trainings; return the runs."""
     trained = dict[Training, Run]()
     for name, seed in trainings_of(config):
         first = trained.get((encoder_owner(config, name), encoder_seed_of(config, name, seed)))
@@ -116,10 +116,11 @@ def _first(config: Config) -> str:
 
 
 def seeds_of(config: Config, name: str) -> list[int]:
-    """Return the seeds of a variant, in the order of `study.seeds`: all of these unless it names fewer.
+    """Return the seeds of a variant in the order of `study.seeds`: all of them unless it names fewer.
 
     Raises:
-        ConfigError: They are fewer than two, or others, or it is the first variant, which has all.
+        ConfigError: The variant names fewer than two seeds or unknown ones, or is the first variant, which
+            must have all.
     """
     every, named = config.own.seeds, config.own.variants[name].get(SEEDS)
     if named is None:
@@ -135,10 +136,11 @@ def seeds_of(config: Config, name: str) -> list[int]:
 
 
 def encoder_seed_of(config: Config, name: str, seed: int) -> int:
-    """Return the seed of the training of the first variant whose encoder a training uses, if not its own.
+    """Return the seed whose encoder a training uses: its own seed, or the variant's `encoder_seed`.
 
     Raises:
-        ConfigError: The variant names another seed, needs an encoder of its own, or is the first.
+        ConfigError: `encoder_seed` is not in `study.seeds`, or the variant is the first or needs an encoder
+            of its own.
     """
     named = config.own.variants[name].get(ENCODER_SEED)
     if named is None:
@@ -153,20 +155,20 @@ def encoder_seed_of(config: Config, name: str, seed: int) -> int:
 
 
 def encoder_owner(config: Config, name: str) -> str:
-    """Return the first variant whose encoders learn from the same settings, often the variant itself."""
+    """Return the first variant whose encoders learn from the same settings; often the variant itself."""
     own = _encoder_changes(config, name)
     return next(other for other in config.own.variants if _encoder_changes(config, other) == own)
 
 
 def shares_encoder(config: Config, name: str) -> bool:
-    """Whether a variant uses the encoders of an earlier one: it has one, and starts from no policy."""
+    """Whether a variant uses an earlier variant's encoders; False if it has none or starts from a policy."""
     if changes_of(config, name).get(INIT) is not None or encoder_owner(config, name) == name:
         return False
     return variant_config(config, name, config.own.seeds[0]).model.has_encoder
 
 
 def _encoder_changes(config: Config, name: str) -> dict[str, Any]:
-    """Return the settings that a variant changes and that its encoder learns from."""
+    """Return the changed settings of a variant that affect what its encoder learns from."""
     return {key: value for key, value in changes_of(config, name).items() if not key.startswith(SAME_ENCODER)}
 
 
@@ -176,10 +178,10 @@ def changes_of(config: Config, name: str) -> dict[str, Any]:
 
 
 def variant_config(config: Config, name: str, seed: int) -> Config:
-    """Return the experiment of one training.
+    """Return the configuration of one training.
 
     Raises:
-        ConfigError: It has a wrong key or value.
+        ConfigError: The variant has a wrong key or value.
     """
     changes, first = changes_of(config, name), _first(config)
     values = as_dict(config) | {"job": "train", "exp": f"{config.exp}_{name}", "seed": seed}
@@ -198,7 +200,7 @@ def variant_config(config: Config, name: str, seed: int) -> Config:
 
 
 def _set(values: Any, key: str, value: Any) -> None:
-    """Replace one value in nested containers; `parse` checks that its key is one."""
+    """Replace one value in nested containers; `parse` rejects an unknown last key."""
     *path, last = [int(word) if word.isdigit() else word for word in key.split(".")]
     try:
         for name in path:
@@ -209,12 +211,12 @@ def _set(values: Any, key: str, value: Any) -> None:
 
 
 def train_variant(config: Config, name: str, seed: int, first: Run | None) -> Run:
-    """Train a variant unless that is done, on the encoder of the run `first` where it may."""
+    """Train a variant unless it is finished, with the encoder of the run `first` if they share it."""
     own = open_run(variant_config(config, name, seed))
     if finished(own, "train") is None:
         console.print(f"Train {name}, seed {seed}", markup=False)
         if first is not None and shares_encoder(config, name) and finished(own, "pretrain") is None:
-            for file in ENCODER_FILES:  # the marks of the finished stages last
+            for file in ENCODER_FILES:  # the markers of finished stages come last
                 (own.path / file).parent.mkdir(parents=True, exist_ok=True)
                 shutil.copy2(first.path / file, own.path / file)
         train.run(own.config)
@@ -222,7 +224,7 @@ def train_variant(config: Config, name: str, seed: int, first: Run | None) -> Ru
 
 
 def minutes(training: Run) -> float:
-    """Return how long a policy was trained, without its encoder [min]."""
+    """Return the training time of a policy without its encoder [min]."""
     rows = read_json_lines(training.train / "results.jsonl")
     ends = [0, *(row["env_steps"] for row in rows)]
     steps = [end - begin for begin, end in itertools.pairwise(ends)]

@@ -29,7 +29,7 @@ def _memory(value: Value) -> str:
     return MEMORIES.get(str(value), f"memory {value}")
 
 
-# Axis -> a value of it in words.
+# Axis -> function that returns one of its values in words.
 WORDS: dict[str, Callable[[Value], str]] = {
     NOMINAL: lambda value: "nothing changed",
     "control_hz": lambda value: f"{text_of(value)} Hz",
@@ -47,7 +47,7 @@ WORDS: dict[str, Callable[[Value], str]] = {
     "pixels": lambda value: f"memory in each pixel, {text_of(value)} Hz",
     "speed": lambda value: f"{text_of(value)} m/s",
 }
-# Axis of numbers -> what is varied, with its unit.
+# Numeric axis -> its label with the unit.
 TITLES = {
     "control_hz": "Control rate [Hz]",
     "control_hz_dense": "Among more poles [Hz]",
@@ -59,6 +59,6 @@ TITLES = {
 
 
 def condition_text(at: Condition) -> str:
-    """Return a condition in words; of an axis without any, its name and the value."""
+    """Return a condition in words; axis name and value if `WORDS` lacks the axis."""
     axis, value = at
     return WORDS[axis](value) if axis in WORDS else f"{axis} {text_of(value)}"

@@ -1,1 +1,1 @@
-"""Jobs on a recording, camera, policy or machine: calibrate, search, publish, replay, fingerprint."""
+"""Jobs for recordings, cameras, policies and machines: calibrate, search, publish, replay, fingerprint."""

@@ -18,7 +18,7 @@ COLUMNS = ("exp", "seed", "env_steps", "success_rate", "distance_m")
 
 
 def read_curves(folder: Path) -> dict[tuple[str, int], Curve]:
-    """Read `curves.csv` in `folder`: group and seed -> curve, for policies that are in the folder too."""
+    """Read `curves.csv` in `folder`: group and seed -> curve, for policies that are also in the folder."""
     file = folder / "curves.csv"
     rows = csv.DictReader(file.read_text().splitlines() if file.is_file() else [])
     found: dict[tuple[str, int], list[list[float]]] = defaultdict(list)
@@ -32,7 +32,7 @@ def read_curves(folder: Path) -> dict[tuple[str, int], Curve]:
 
 
 def by_reward(folder: Path, curves: Sequence[Curve]) -> list[Curve]:
-    """Return the curves of policies in `folder` that learnt from rewards, not by imitation."""
+    """Return the curves of policies in `folder` trained on rewards, not by imitation."""
     manifests = [read_json(folder / f"{one.exp}-s{one.seed}" / MANIFEST) for one in curves]
     return [
         one
@@ -42,7 +42,7 @@ def by_reward(folder: Path, curves: Sequence[Curve]) -> list[Curve]:
 
 
 def as_csv(curves: Sequence[Curve]) -> str:
-    """Return the curves as one table, a row per point."""
+    """Return the curves as one CSV table, a row per point."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)
@@ -53,15 +53,16 @@ def as_csv(curves: Sequence[Curve]) -> str:
 
 
 class PublishedTraining(NamedTuple):
-    """How a published training learnt, and what its encoder had taken before; no manifest says its minutes.
+    """Learning speed of a published training, and the cost of its encoder. Manifests lack the training time.
 
     Attributes:
-        group, seed: Which one.
-        env_steps: Of the policy's training, without those of its encoder.
-        encoder_env_steps: Recorded for its encoder; 0 without one.
-        encoder_iterations: Of the encoder's pretraining.
-        mean_success: Of the policy's first `COMPARED_STEPS`, see `mean_success`; None: it took fewer.
-        mean_success_with_encoder: The same, with the encoder's steps as the first.
+        group, seed: Group and seed of the training.
+        env_steps: Environment steps of the policy's training, without the encoder's.
+        encoder_env_steps: Steps recorded for its encoder; 0 without an encoder.
+        encoder_iterations: Iterations of the encoder's pretraining.
+        mean_success: Mean over the policy's first `COMPARED_STEPS`, see `mean_success`; None: the training
+            was shorter.
+        mean_success_with_encoder: The same mean, if the encoder's steps count first.
     """
 
     group: str
@@ -96,17 +97,17 @@ def _published(folder: Path, curve: Curve) -> PublishedTraining:
 
 
 def mean_success(curve: Curve, env_steps: int, before: int = 0) -> float:
-    """Success rate, 0..1, averaged over a training's first steps: high if it learns early and well.
+    """Return the success rate, 0..1, averaged over a training's first steps: high for fast, good learning.
 
-    A curve is linear between its points, and 0 until its training begins.
+    The curve is interpolated linearly between its points, and 0 until the training begins.
 
     Args:
-        curve: With a point at `env_steps` or later.
-        env_steps: How many first steps [-].
-        before: Steps among these that were taken before its training, for its encoder [-].
+        curve: A learning curve with a point at `env_steps` or later.
+        env_steps: Number of first steps to average over [-].
+        before: Steps among these that precede the training, for the encoder [-].
 
     Raises:
-        ValueError: The curve ends before.
+        ValueError: The curve ends before `env_steps`.
     """
     steps = np.concatenate([[0.0, before], curve.env_steps + before])
     success = np.concatenate([[0.0, 0.0], curve.success_rate])

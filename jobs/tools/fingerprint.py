@@ -1,8 +1,8 @@
 """The digits of this machine: a hash of what each stage of a training makes, beside the published ones.
 
 Run: evade fingerprint
-Expect: half a minute on one core; "equal", or the first stage that differs and exit status 1. A later stage
-begins from what an earlier one made. Without a published file it is written.
+Expect: half a minute on one core; "equal", or the first stage that differs and exit status 1. Later stages
+start from the output of earlier ones. If no fingerprint is published yet, this one is written.
 """
 
 import dataclasses
@@ -47,8 +47,8 @@ PUBLISHED = REPOSITORY / "docs" / "data" / "fingerprints.json"
 FLAGS = ("avx2", "fma", "avx512f", "avx512vl", "avx512_bf16", "amx_tile")
 PACKAGES = ("numpy", "numba", "llvmlite", "torch", "scipy")
 SCENES = ("poles", "shape_change", "texture_change", "dynamic")
-STEPS = 64  # control steps in each scene, and of a round of PPO
-ITERATIONS = 4  # of an encoder
+STEPS = 64  # control steps in each scene, and in each round of PPO
+ITERATIONS = 4  # of each encoder's training
 ENCODERS = {
     "": EvaeSettings("bytestream", 64, 64, 256, 32, "batch", "occupancy", 1024, "additive"),
     ", rotated and signed": EvaeSettings("bytestream", 64, 64, 64, 8, "batch", "signed", 256, "eventnet"),
@@ -65,11 +65,11 @@ Arrays = Iterable[Any]
 
 
 class FingerprintError(RunError):
-    """A stage has other digits than the published ones."""
+    """A stage whose digits differ from the published ones."""
 
 
 def run(config: Config) -> dict[str, str]:
-    """Compute and print the fingerprint; compare it with the published one.
+    """Compute and print the fingerprint, and compare it with the published one.
 
     Raises:
         FingerprintError: A stage differs; the message names the first.
@@ -91,7 +91,7 @@ def run(config: Config) -> dict[str, str]:
 
 
 def machine() -> dict[str, str]:
-    """Describe this processor, and the libraries that compute on it."""
+    """Describe this processor and the versions of the numerical packages."""
     known = processor()
     flags = set(known.get("flags", "").split())
     name = (
@@ -105,12 +105,12 @@ def machine() -> dict[str, str]:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of the packages that compute."""
+    """Return the versions of the numerical packages."""
     return {package: version(package).partition("+")[0] for package in PACKAGES}
 
 
 def digest(arrays: Arrays) -> str:
-    """Return the first 16 digits of the SHA-256 of all bytes, one array after the other."""
+    """Return the first 16 hexadecimal digits of the SHA-256 of all arrays in turn."""
     whole = hashlib.sha256()
     for array in arrays:
         whole.update(np.ascontiguousarray(array).tobytes())
@@ -118,7 +118,7 @@ def digest(arrays: Arrays) -> str:
 
 
 def stages(config: Config) -> Iterator[tuple[str, Arrays]]:
-    """Yield the stages in the order of a training: name, and the arrays that it makes."""
+    """Yield the stages in the order of a training: name, and the arrays that the stage computes."""
     yield "pictures", pictures()
     recording = recorded(config)
     yield "events", [recording.events, *recording.index.values()]
@@ -142,7 +142,7 @@ def stages(config: Config) -> Iterator[tuple[str, Arrays]]:
 
 
 def pictures() -> Iterator[np.ndarray]:
-    """Return a picture of each scene, float32 (H, W)."""
+    """Yield a picture of each scene, float32 (H, W)."""
     for name in SCENES:
         yield RaycastRenderer(make_scene(name, np.random.default_rng(0)), 64, 64).render(0.1, 5.0, 2.0, 0.05)
 
@@ -162,7 +162,7 @@ def weights(network: torch.nn.Module) -> list[np.ndarray]:
 
 
 def tabulated(evae: EventVAE) -> list[np.ndarray]:
-    """Return the outputs of an encoder's table."""
+    """Return the arrays of an encoder's lookup table."""
     table = EncoderTable.from_evae(evae.eval())
     return [table.features, table.embedding]
 
@@ -170,9 +170,9 @@ def tabulated(evae: EventVAE) -> list[np.ndarray]:
 def learnt(config: Config) -> list[np.ndarray]:
     """Return the weights of a policy after two updates of the experiment's learner."""
     torch.manual_seed(0)
-    logging.getLogger("ray").setLevel(logging.ERROR)  # it calls its own settings outdated
+    logging.getLogger("ray").setLevel(logging.ERROR)  # hide Ray's warnings about its own settings
     ppo = algorithm_of(config).build(config, None, None)
-    with warnings.catch_warnings(action="ignore"):  # the stage before has registered the same environment
+    with warnings.catch_warnings(action="ignore"):  # the previous stage registered the same environment
         runner = ppo.env_runner_cls(config=ppo, worker_index=0)
     learner = ppo.build_learner(env=runner.env)
     for count in (1, 2):

@@ -1,12 +1,11 @@
 """Put trained policies where a fresh clone finds them, and draw their learning curves.
 
 Run: make train-all, which trains every policy and ends with this; or python -m platform.launch +exp=publish
-Expect: seconds. In models/pretrained a folder <group>-s<seed> for the newest training of each
-experiment, length and seed in `runs_dir` with the configured budget, 0.1 to 2 megabytes each
-(weights in float16, no decoder), `curves.csv` and, in docs/images, `learning.png`; what was published
-before stays. A group is an experiment; trainings of another length than the one that all are
-compared at have its thousands of steps behind their name: bytestream_1500k. Each becomes a
-version in MLflow's model registry.
+Expect: seconds. In models/pretrained a folder <group>-s<seed> for the newest training of each experiment,
+length and seed in `runs_dir` with the configured budget, 0.1 to 2 megabytes each (weights in float16, no
+decoder), and `curves.csv`; in docs/images `learning.png`. Policies published earlier stay. A group is named
+after its experiment; if its training does not have the usual length for comparisons, thousands of steps are
+appended: bytestream_1500k. Each policy becomes a version in MLflow's model registry.
 """
 
 from collections import Counter
@@ -37,7 +36,7 @@ STAGES = ("collect", "pretrain", "train")
 
 @dataclass(frozen=True)
 class Training:
-    """A finished training: its run folder, what it is one training of, its seed, and what made it."""
+    """A finished training: its run folder, group, seed, and provenance."""
 
     path: Path
     group: str
@@ -46,15 +45,15 @@ class Training:
 
     @property
     def name(self) -> str:
-        """Return the name of its policy's folder."""
+        """Return the folder name of the published policy."""
         return f"{self.group}-s{self.seed}"
 
 
 def run(config: Config) -> dict[str, int]:
-    """Publish the finished trainings; return how many of each group.
+    """Publish the finished trainings; return group -> their number.
 
     Raises:
-        ConfigError: There is none, or the budget is one that learns nothing.
+        ConfigError: There is no finished training, or the budget is too small to learn anything.
     """
     if config.budget == "smoke":
         raise ConfigError("budget: smoke learns nothing, and would replace what is published; choose another")
@@ -66,7 +65,7 @@ def run(config: Config) -> dict[str, int]:
         target = publish(training, PRETRAINED)
         size = sum(file.stat().st_size for file in target.iterdir())
         console.print(f"{target.relative_to(REPOSITORY)}: {size / 1024:,.0f} KiB")
-    published = read_curves(PRETRAINED)  # also of trainings elsewhere, or whose run folders are gone
+    published = read_curves(PRETRAINED)  # includes trainings without a run folder on this machine
     published |= {(training.group, training.seed): learning_curve(training) for training in trainings}
     curves = [published[key] for key in sorted(published)]
     write_atomic(PRETRAINED / "curves.csv", as_csv(curves))
@@ -82,7 +81,7 @@ def run(config: Config) -> dict[str, int]:
 
 
 def newest_trainings(runs_dir: Path, budget: str) -> list[Training]:
-    """Return the training of each group and seed that was finished last, by group and seed."""
+    """Return the latest finished training of each group and seed, sorted by these."""
     found: dict[tuple[str, int], Training] = {}
     markers = sorted(runs_dir.glob("*/stages/train.json"), key=lambda marker: marker.stat().st_mtime_ns)
     for marker in markers:
@@ -104,14 +103,14 @@ def newest_trainings(runs_dir: Path, budget: str) -> list[Training]:
 
 
 def made_by(run: Path) -> dict[str, dict[str, object]]:
-    """Return stage -> commit and device of each stage of a run: its encoder may be older than its policy."""
+    """Return stage -> commit and device of a run; they differ if the encoder is older than the policy."""
     markers = {stage: run / "stages" / f"{stage}.json" for stage in STAGES}
     found = {stage: read_json(marker) for stage, marker in markers.items() if marker.is_file()}
     return {stage: {"commit": own["commit"], "device": own.get("device")} for stage, own in found.items()}
 
 
 def publish(training: Training, folder: Path) -> Path:
-    """Write the policy of a training into `folder`, with what made it in its manifest; return its folder."""
+    """Write a training's policy into `folder`, with provenance in the manifest; return the policy folder."""
     target = folder / training.name
     save_lean_policy(training.path / "policy", target, training.about)
     load_policy(target)
@@ -119,7 +118,7 @@ def publish(training: Training, folder: Path) -> Path:
 
 
 def learning_curve(training: Training) -> Curve:
-    """Return the success and distance of a training at about `MAX_POINTS` of its iterations."""
+    """Return success and distance of a training at no more than `MAX_POINTS` of its iterations."""
     lines = read_json_lines(training.path / "train" / "results.jsonl")
     rows = [row for row in lines if row["train/success_rate"] is not None]
     kept = np.unique(np.linspace(0, len(rows) - 1, min(MAX_POINTS, len(rows))).astype(int))

@@ -2,7 +2,7 @@
 
 Run: python -m platform.launch +exp=replay replay.recording=street.raw replay.policy=bytestream_hold-s0
 Expect: seconds. A line of numbers; `replay/choices.csv` and a film of the events and the choices in the run
-folder. Nothing moves: the recording is what it is, whatever the policy chooses (docs/camera.md).
+folder. The policy's choices have no effect on the recording (docs/camera.md).
 """
 
 import time
@@ -26,18 +26,18 @@ from jobs.training.real_recordings import Recorded, read_whole
 from models.policy import Policy, load_policy
 
 HEADINGS, LATENCY = ("Recording", "Policy", "Steps", "Events/step"), ("p50", "p95", "p99")
-SHOWN_ACTIONS = 3  # columns of the table of numbers; the CSV file has the probabilities of more
+SHOWN_ACTIONS = 3  # most action columns in the table; the CSV file has all probabilities
 FILM_FPS, SLOWEST_FPS = 50.0, 5.0
-BARS = (245, 158, 11)  # their colour
-FAR = 5.0  # times the event rate of the training, or less than its reciprocal: a warning
+BARS = (245, 158, 11)  # colour of the bars
+FAR = 5.0  # warn if the event rate differs from the training's by more than this factor
 
 
 @dataclass(frozen=True, config=STRICT)
 class Settings:
-    """Which recording which policy looks at.
+    """The recording and the policy.
 
     Attributes:
-        recording: An event file, of any format that `envs.recordings.read_events` knows.
+        recording: An event file in any format that `envs.recordings.read_events` reads.
         policy: A name in models/pretrained, "newest", or a path.
     """
 
@@ -46,13 +46,13 @@ class Settings:
 
 
 class Choice(NamedTuple):
-    """What a policy made of one control step.
+    """A policy's choice at one control step.
 
     Attributes:
-        start_us, end_us: The step [us].
-        events: EVENT of it.
-        probabilities: Of the actions, float64 (K,).
-        seconds: What the choice took.
+        start_us, end_us: Start and end of the step [us].
+        events: Events of the step, EVENT (N,).
+        probabilities: Probabilities of the actions, float64 (K,).
+        seconds: Wall time of the choice [s].
     """
 
     start_us: int
@@ -63,11 +63,11 @@ class Choice(NamedTuple):
 
 
 def run(config: Config) -> list[Choice]:
-    """Replay `replay.recording` to `replay.policy`; return what it chose.
+    """Replay `replay.recording` to `replay.policy`; return its choices.
 
     Raises:
-        ConfigError: There is no such policy, or it sees no events, or more than events; or the recording is
-            refused.
+        ConfigError: The policy does not exist, sees no events, or needs the vehicle's velocity; or the
+            recording is invalid.
     """
     found = find_one_policy("replay.policy", config.own.policy, config, locate_run(config))
     policy = load_policy(found.agent)
@@ -99,10 +99,10 @@ def run(config: Config) -> list[Choice]:
 
 
 def choose(policy: Policy, recorded: Recorded) -> list[Choice]:
-    """Return what a policy chooses at each control step of a recording; it remembers the steps before."""
+    """Return a policy's choice at each control step of a recording; its memory spans earlier steps."""
     policy.reset()
     first_us = int(recorded.events["t"][0]) if recorded.events.size else 1
-    policy.event_logits(recorded.events[:1], first_us - 1, 1)  # compiles
+    policy.event_logits(recorded.events[:1], first_us - 1, 1)  # compile before timing
     policy.reset()
     starts_us = np.concatenate(([0], recorded.ends_us[:-1]))
     cuts = np.searchsorted(recorded.events["t"], np.append(starts_us, recorded.ends_us[-1]), side="right")
@@ -121,13 +121,13 @@ def choose(policy: Policy, recorded: Recorded) -> list[Choice]:
 
 
 def trained_rate(policy: Policy) -> float | None:
-    """Return the mean events of a control step in the training of a policy, None if its file lacks them."""
+    """Return the mean events per control step in a policy's training; None if its manifest lacks them."""
     rate = policy.manifest.get("figures", {}).get("sim/events_per_step")
     return None if rate is None else float(rate)
 
 
 def _tell_rate(recorded: Recorded, trained: float | None) -> None:
-    """Print a warning if a recording's event rate is far from what the policy knows."""
+    """Print a warning if a recording's event rate is far from the training's."""
     rate = recorded.events.size / len(recorded.ends_us)
     if trained is not None and not trained / FAR <= rate <= trained * FAR:
         console.print(
@@ -138,7 +138,7 @@ def _tell_rate(recorded: Recorded, trained: float | None) -> None:
 
 
 def line(recording: str, policy: str, choices: list[Choice]) -> tuple[str, ...]:
-    """Return a text for each heading of the table."""
+    """Return a text for each heading of the table of numbers."""
     likeliest, count = [choice.probabilities.argmax() for choice in choices], choices[0].probabilities.size
     shares = [f"{100 * np.equal(likeliest, action).mean():.0f}" for action in range(count)]
     shares = shares if count <= SHOWN_ACTIONS else []
@@ -148,7 +148,7 @@ def line(recording: str, policy: str, choices: list[Choice]) -> tuple[str, ...]:
 
 
 def write_choices(file: Path, choices: list[Choice], names: Sequence[str]) -> None:
-    """Write a CSV file with a row for each control step: its end [us], events, and actions' probabilities."""
+    """Write a CSV row for each control step: its end [us], number of events, and action probabilities."""
     rows = [(one.end_us, one.events.size, *(f"{p:.4f}" for p in one.probabilities)) for one in choices]
     write_csv(file, ("end_us", "events", *names), rows)
 
@@ -156,12 +156,12 @@ def write_choices(file: Path, choices: list[Choice], names: Sequence[str]) -> No
 def write_film(
     path: Path, choices: list[Choice], shape: tuple[int, int], said: tuple[str, Sequence[str]], hz: float
 ) -> Path:
-    """Write an MP4 file with a frame for each control step: its events, and the choice; return it.
+    """Write an MP4 file with a frame for each control step, events and choice; return its path.
 
-    `said` is the title, and the name of each action.
+    `said` holds the title and the name of each action.
     """
     title, names = said
-    # As a person looks, from the left.
+    # Three actions are shown from left to right.
     order = (1, 0, 2) if len(names) == SHOWN_ACTIONS else range(len(names))
     with open_film(path, hz, None, float(np.clip(hz / 4, SLOWEST_FPS, FILM_FPS))) as film:
         for choice in choices:

@@ -1,8 +1,8 @@
 """Write one page, which needs no server and no network, to scrub through recorded episodes of policies.
 
 Run: python -m platform.launch +exp=replay_page
-Expect: a minute or two. `replay/replay.html` in run folder and MLflow; `+exp=report` copies it to docs/.
-Each of `replay_page.policies` goes through the corridor of `seed` in each scene, at each rate, with each
+Expect: a minute or two. `replay/replay.html` in the run folder and in MLflow; `+exp=report` copies it to
+docs/. Each of `replay_page.policies` flies the corridor of `seed` in each scene, at each rate, with each
 noise. The same settings give the same bytes.
 """
 
@@ -51,7 +51,7 @@ class Settings:
 
     Attributes:
         policies: Each a name in models/pretrained, "newest", or a path.
-        scenes: Layouts.
+        scenes: Names of layouts.
         background_activity: False events per true event.
         control_hz: Actions per second [Hz].
     """
@@ -63,10 +63,10 @@ class Settings:
 
 
 def run(config: Config) -> dict[str, int]:
-    """Record the episodes, write the page and track it; return how many there are, and reach the goal.
+    """Record the episodes, write the page and track it; return the number of episodes.
 
     Raises:
-        ConfigError: If a policy is not there.
+        ConfigError: A policy does not exist.
     """
     asked, place = config.own, locate_run(config)
     policies = [find_one_policy("replay_page.policies", name, config, place) for name in asked.policies]
@@ -85,7 +85,7 @@ def run(config: Config) -> dict[str, int]:
 def record(
     config: Config, cells: Sequence[Cell], advance: Callable[[int], None]
 ) -> Iterator[RecordedEpisode]:
-    """Yield the episode of each policy under its condition, one by one: each takes tens of MB."""
+    """Yield the episode of each policy under its condition, one by one, as each takes tens of MB."""
     stochastic = config.evaluate.action == "stochastic"
     folders = dict.fromkeys(policy.agent for policy, *_ in cells)
     agents = {folder: PolicyAgent(load_policy(folder), stochastic) for folder in folders}
@@ -97,21 +97,21 @@ def record(
 
 
 def write_page(folder: Run, data: Mapping[str, object]) -> Path:
-    """Write the page of `page_data` into the run folder; return it."""
+    """Write the page with `page_data` into the run folder; return its path."""
     place = folder.path / "replay"
     text = json.dumps(data, separators=(",", ":"), allow_nan=False)
     page = render(TEMPLATE, data=text.replace("</", r"<\/"), command=command())
     write_atomic(place / PAGE, page)
-    write_json(place / "about.json", {"command": command()})  # the last: it says that the page is there
+    write_json(place / "about.json", {"command": command()})  # written last: it marks the page as complete
     return place / PAGE
 
 
 def page_data(cells: Sequence[Cell], recorded: Iterable[RecordedEpisode]) -> dict[str, object]:
-    """Return the data of the page as JSON values; each choice is an index into its list.
+    """Return the data of the page as JSON values; an episode's choices are indices into the lists.
 
     Args:
-        cells: Whose episodes these are, and under which conditions.
-        recorded: The episodes in the same order, each needed once.
+        cells: Policy, scene, noise and rate of each episode.
+        recorded: The episodes in the same order; consumed once.
     """
     named = [(f"{policy.group}-s{policy.training}", *rest) for policy, *rest in cells]
     columns = dict(zip(CHOICES, zip(*named, strict=True), strict=True))
@@ -130,7 +130,7 @@ def page_data(cells: Sequence[Cell], recorded: Iterable[RecordedEpisode]) -> dic
 
 
 def plan(recorded: RecordedEpisode) -> dict[str, object]:
-    """Return the corridor of an episode from above, to the centimetre, and the pixels of its camera."""
+    """Return an episode's corridor from above, rounded to centimetres, and its camera's size in pixels."""
     scene, env = recorded.scene, recorded.env
     circles, corners = (shapes.round(2).tolist() for shapes in ground_plan(scene, env.camera_height_m))
     return {
@@ -140,7 +140,7 @@ def plan(recorded: RecordedEpisode) -> dict[str, object]:
 
 
 def packed_episode(recorded: RecordedEpisode) -> dict[str, object]:
-    """Return the numbers of an episode, and its moments as zlib of `columns` in base64."""
+    """Return the numbers of an episode, and its moments as base64 of the zlib-packed `columns_of`."""
     row, control_hz = recorded.episode, recorded.env.control_hz
     shown = shown_steps(len(recorded.moments), control_hz)
     moments = [recorded.moments[step] for step in shown]
@@ -157,7 +157,7 @@ def packed_episode(recorded: RecordedEpisode) -> dict[str, object]:
 
 
 def shown_steps(steps: int, control_hz: float) -> list[int]:
-    """Choose the steps of an episode to show: `FRAMES_PER_S` of them a second, and the last."""
+    """Choose the steps of an episode to show: `FRAMES_PER_S` per simulated second, and the last."""
     stride = max(1, round(control_hz / FRAMES_PER_S))
     return sorted({*range(0, steps, stride), steps - 1})
 
@@ -165,16 +165,16 @@ def shown_steps(steps: int, control_hz: float) -> list[int]:
 def columns_of(
     shown: Sequence[int], moments: Sequence[Moment], latents: np.ndarray
 ) -> Mapping[str, np.ndarray]:
-    """Return the moments as arrays of small integers, in the order of the bytes; the template reads them.
+    """Return the moments as arrays of small integers, in the byte order that the template reads.
 
     Args:
-        shown: Their steps, (F,).
-        moments: What was seen and chosen at these, (F,).
-        latents: In [-1, 1], (F, L).
+        shown: Steps of the moments, (F,).
+        moments: What the policy saw and chose at these steps, (F,).
+        latents: Scaled to [-1, 1], (F, L).
 
     Returns:
-        uint16 and int16 first, then bytes: step, x and y in centimetres, events of the step, how many pixels
-        have events, and these pixels, column by column, each as 2 * (distance to the one before) + (1 if ON);
+        uint16 and int16 first, then bytes: step, x and y in centimetres, events of the step, number of pixels
+        with events, and these pixels in column order, each as 2 * (distance to the previous one) + (1 if ON);
         latents in 1 / 127, probabilities in 1 / 255 (F, 3), action.
     """
     fired = [pixels(one.events) for one in moments]
@@ -192,12 +192,12 @@ def columns_of(
 
 
 def planes(column: np.ndarray) -> bytes:
-    """Return the low bytes of all numbers, then any high bytes: zlib packs these better."""
+    """Return the low bytes of all numbers, then any high bytes: zlib compresses this order better."""
     return np.ascontiguousarray(column).view("u1").reshape(-1, column.itemsize).T.tobytes()
 
 
 def pixels(events: np.ndarray | None) -> np.ndarray:
-    """Return the pixels with events of an event image (H, W), as `columns_of` codes them.
+    """Return the pixels with events of an event image (H, W), coded as in `columns_of`.
 
     Raises:
         ValueError: The image is too large for 16 bits.

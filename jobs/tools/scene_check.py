@@ -1,7 +1,7 @@
 """Check a file of spheres before anyone flies in it: what can be passed, and what the camera cannot draw.
 
 Run: evade scene check FILE.csv
-Expect: seconds; a line for each height, for a point, as the DodgeDrone challenge has it, and for our vehicle.
+Expect: seconds; a line for each height, for a point vehicle as in the DodgeDrone challenge, and for ours.
 """
 
 from dataclasses import replace
@@ -24,13 +24,13 @@ from jobs.run.progress import console
 
 HEAD = ("Height [m]", "Discs", "Passable, point", "Passable, 0.3 m", "Straight on free, point", "0.3 m")
 AMONG, MOVING = ("Planned among what moves, point", "0.3 m"), "dynamic_obstacles.yaml"
-RADII_M = (0.0, 0.3)  # the challenge's vehicle, and ours
+RADII_M = (0.0, 0.3)  # of the challenge's vehicle, and of ours
 STARTS = 21
 
 
 @dataclass(frozen=True, config=STRICT)
 class Settings:
-    """Which file is checked, at which heights, and how far the goal is."""
+    """The file to check, the heights and the speed of flight, and the distance of the goal."""
 
     file: Name
     heights_m: Annotated[list[Positive], Field(min_length=1)]
@@ -39,7 +39,7 @@ class Settings:
 
 
 def run(config: Config) -> dict[str, float]:
-    """Print the check; return how many heights our vehicle can pass.
+    """Print the check; return the number of heights that our vehicle can pass, and of overlaps.
 
     Raises:
         ConfigError: The file cannot be read, or a row cannot be drawn.
@@ -65,7 +65,7 @@ def run(config: Config) -> dict[str, float]:
 
 
 def with_moving(scene: Scene) -> Scene:
-    """Return the scene of a file with the spheres that move beside it, if these can be read."""
+    """Add the moving spheres from the file next to a scene's file, if they can be read."""
     try:
         return replace(scene, moving=moving_spheres(SphereLayout(file=scene.name, moving=True)))
     except ValueError as error:
@@ -74,7 +74,7 @@ def with_moving(scene: Scene) -> Scene:
 
 
 def line(scene: Scene, height_m: float, speed_mps: float) -> tuple[str, ...]:
-    """Return the texts of one height."""
+    """Return the texts of the line for one height."""
     passable = ["yes" if scene.passable(radius_m, height_m) else "no" for radius_m in RADII_M]
     starts = np.linspace(*scene.spawn_range_m, STARTS)
     free = [

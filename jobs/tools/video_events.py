@@ -1,7 +1,7 @@
 """Write the events that the configured camera would have seen of a video or a folder of images.
 
 Run: python -m platform.launch +exp=video_events video_events.path=ride.mp4 camera=davis346 light=night
-Expect: seconds to minutes. A line of numbers and the file, with labels of noise where its format holds them.
+Expect: seconds to minutes. A line of numbers and the file, with noise labels if the format supports them.
 """
 
 import dataclasses
@@ -35,15 +35,15 @@ HEADINGS = (
 
 @dataclass(frozen=True, config=STRICT)
 class Settings:
-    """Which video becomes events. The camera is that of the environment, and so are its size and its faults.
+    """The video to convert. Camera, size and faults are those of the configured environment.
 
     Attributes:
         path: A video, or a folder of images, as `envs.recordings.video_steps` reads them.
-        output: The event file, of the format that its suffix names; None: events.npz in the run folder.
-        fps: Frames per second, in place of the times that the video or the folder has [Hz].
-        transfer: How values become light; None: floating point is linear, whole numbers are sRGB.
-        interpolate: What is taken to be between two frames.
-        luminance_floor: Of the camera, in place of its own, white = 1; None: what is right for the frames
+        output: The event file, in the format of its suffix; None: events.npz in the run folder.
+        fps: Frames per second, instead of the times in the video or folder [Hz].
+        transfer: Transfer function from values to light; None: linear for floats, sRGB for integers.
+        interpolate: Assumption about the light between two frames.
+        luminance_floor: Replaces the camera's own floor, white = 1; None: a suitable one for the frames
             (`envs.recordings.light.usual_floor`).
     """
 
@@ -56,10 +56,10 @@ class Settings:
 
 
 def run(config: Config) -> Path:
-    """Write the events of `video_events.path` as the configured camera would report them; return their file.
+    """Write the events of `video_events.path` as the configured camera would report them; return the file.
 
     Raises:
-        ConfigError: The video is refused, or `video_events.output` cannot hold its events.
+        ConfigError: The video is invalid, or `video_events.output` cannot store its events.
     """
     output = Path(config.own.output or open_run(config).path / "video" / "events.npz")
     kind = WRITTEN_SUFFIXES.get(output.suffix.lower(), "")
@@ -87,7 +87,7 @@ def run(config: Config) -> Path:
 
 @dataclasses.dataclass
 class Counts:
-    """What the events of a video are, counted while they are written.
+    """Statistics of a video's events, counted while they are written.
 
     Attributes:
         events, on, noise, dropped: Numbers of events: all, ON, noise, lost.
@@ -121,10 +121,10 @@ class Counts:
 def write_steps(
     steps: Iterator[VideoStep], output: Path, kind: str, size: tuple[int, int]
 ) -> tuple[Counts, list[str]]:
-    """Write the events of each frame as it comes, with a line now and then; return counts and warnings.
+    """Write the events frame by frame, printing progress now and then; return counts and warnings.
 
     Raises:
-        ConfigError: The video is refused, or the format cannot store its events.
+        ConfigError: The video is invalid, or the format cannot store its events.
     """
     counts, is_labelled, told, frames = Counts(), kind in LABELLED, time.monotonic(), 0
     with warnings.catch_warnings(record=True) as said:
@@ -149,7 +149,7 @@ def write_steps(
 
 
 def _refusing(steps: Iterator[VideoStep]) -> Iterator[VideoStep]:
-    """Yield the steps of a video; raise ConfigError if it is refused."""
+    """Yield the steps of a video; raise ConfigError if it is invalid."""
     try:
         yield from steps
     except (ValueError, OSError, RuntimeError) as error:
@@ -174,5 +174,5 @@ def line(name: str, counts: Counts) -> tuple[str, ...]:
 
 
 def percent(some: int, all_of_them: int) -> str:
-    """Return a share in percent."""
+    """Return a share in per cent as text; "-" if the whole is 0."""
     return f"{100 * some / all_of_them:.1f}" if all_of_them else "-"

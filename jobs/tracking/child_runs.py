@@ -12,7 +12,7 @@ MAX_CHILDREN = 10_000  # of one run
 
 
 class ChildRun(NamedTuple):
-    """A finished run below another, with its whole content."""
+    """A finished child run with its whole content."""
 
     name: str
     params: Mapping[str, object]
@@ -22,7 +22,7 @@ class ChildRun(NamedTuple):
 
 
 def write_child_runs(parent: Tracker, kind: str, children: Sequence[ChildRun]) -> None:
-    """Write finished runs below `parent`: three calls each, and none for one that exists unchanged.
+    """Write finished child runs of `parent`: three calls each, none for a run that exists unchanged.
 
     A run whose content has changed replaces the run of the same name.
     """

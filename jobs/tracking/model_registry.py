@@ -1,7 +1,7 @@
 """Trained policies in MLflow's model registry: one name for each experiment, one version for each training.
 
 A version is complete in itself: the policy folder (safetensors and JSON), the script `tracking.served_policy`
-and the package `models`. Nothing is pickled, and nothing is installed to find out what it needs.
+and the packages `core` and `models`. Nothing is pickled, and nothing is installed to find its requirements.
 """
 
 import importlib.metadata
@@ -44,10 +44,10 @@ SHOWN = ("eval/success_rate", "eval/success_rate_low", "eval/success_rate_high",
 
 
 def register_training(tracker: Tracker, path: Path) -> str:
-    """Register the policy of a run folder whose training is finished, with what its stages found.
+    """Register the policy of a run folder whose training is finished, with the metrics of its stages.
 
     Returns:
-        As `register`.
+        The version's name, as `register`.
     """
     config = read_json(path / "config.json")
     train, evaluated = (path / "stages" / f"{stage}.json" for stage in ("train", "evaluate"))
@@ -56,19 +56,19 @@ def register_training(tracker: Tracker, path: Path) -> str:
     if evaluated.is_file():
         metrics |= read_json(evaluated)["figures"]["figures"]
     tags = {name: config[name] for name in ("seed", "budget")} | {"run": path.name, "commit": about["commit"]}
-    tags["env_steps"] = config["train"]["env_steps"]  # another length is no other model
+    tags["env_steps"] = config["train"]["env_steps"]  # all lengths are versions of one model
     tags |= {name: metrics[name] for name in SHOWN if name in metrics}
     return register(tracker, path / "policy", config["exp"], tags)
 
 
 def register(tracker: Tracker, policy: Path, group: str, tags: Mapping[str, object]) -> str:
-    """Register the policy of a training, once; a version that is there gets the new tags.
+    """Register the policy of a training once; an existing version gets the new tags.
 
     Args:
-        tracker: The run that trained it.
-        policy: Its folder.
-        group: The experiment that it is one training of.
-        tags: What a reader of the version wants to know; floats are shortened.
+        tracker: The MLflow run of the training.
+        policy: The policy folder.
+        group: The experiment to which the training belongs.
+        tags: Facts for readers of the version; floats are shortened.
 
     Returns:
         The version's name, "evade-bytestream/2".
@@ -88,7 +88,7 @@ def register(tracker: Tracker, policy: Path, group: str, tags: Mapping[str, obje
 
 
 def _add_version(tracker: Tracker, policy: Path, name: str, manifest: Mapping[str, Any]) -> Any:
-    """Write the model's files into the store, and a version that points at them."""
+    """Write the model's files into the store; return a new version that points to them."""
     from mlflow import pyfunc
     from mlflow.entities import LoggedModelOutput
 
@@ -98,7 +98,7 @@ def _add_version(tracker: Tracker, policy: Path, name: str, manifest: Mapping[st
         for copy in code:
             unused = shutil.ignore_patterns("pretrained", "__pycache__")
             shutil.copytree(REPOSITORY / Path(copy).name, copy, ignore=unused)
-        with warnings.catch_warnings():  # it asks for an example, to check the signature by
+        with warnings.catch_warnings():  # MLflow asks for an example of the input
             warnings.simplefilter("ignore", UserWarning)
             pyfunc.save_model(
                 files,

@@ -1,8 +1,8 @@
-"""The text on MLflow's pages of the experiment and of each run, and the views of its runs.
+"""The texts of MLflow's pages for the experiment and for each run, and the views of the runs.
 
-These are texts and plain values; `jobs.tracking.tracker` writes them. MLflow shows pictures in their own
-size and folds long text, so a run's page shows small copies (`page/` among its artifacts) and begins
-with one line that sums it up.
+These are texts and plain values; `jobs.tracking.tracker` writes them. MLflow shows pictures in their full
+size and folds long text, so a run's page shows small copies (`page/` among its artifacts) and starts
+with a one-line summary.
 """
 
 import base64
@@ -17,13 +17,13 @@ from PIL import Image
 from jobs.config.registry import JOBS
 
 WORKFLOW = "workflowType=machine_learning"  # unless an address says so, MLflow opens pages for chat models
-# MLflow's own names: of the text on a page, of a run's colour in charts, of stored views.
+# MLflow's own names of a page's text, a run's colour in charts, and stored views.
 NOTE, COLOUR, VIEW_TAG = "mlflow.note.content", "mlflow.runColor", "mlflow.sharedViewState"
-MAX_CHARACTERS = 8000  # of a run's page; MLflow cuts what is longer, and does not say so
+MAX_CHARACTERS = 8000  # of a run's page; MLflow cuts longer ones without a message
 PAGE_WIDTH = 860  # pixels of a picture between MLflow's side panels on a screen of 1600
 PREVIEWS = "page"
 
-METRICS = {  # metric: what it is, how it is written
+METRICS = {  # metric: description, format
     "eval/success_rate": ("success in held-out corridors", "{:.0%}"),
     "eval/distance_m": ("distance without collision", "{:.1f} m"),
     "train/success_rate": ("success in training", "{:.0%}"),
@@ -34,7 +34,7 @@ METRICS = {  # metric: what it is, how it is written
 }
 FIRST = ("eval/", "sweep/control_hz.", "sweep/contrast_threshold.", "sweep/sparsity.",
          "sweep/background_activity.", "sweep/", "train/")  # fmt: skip
-# A run that stopped with an error or was interrupted is no result; one that is under way may be looked at.
+# A run that failed or was interrupted is not a result; a running one is shown.
 NOT_ENDED_EARLY = "attributes.status != 'FAILED' and attributes.status != 'KILLED'"
 COLUMNS = {  # view: name, filter, columns; the first column orders the runs
     "results": ("Results", f"tags.kind = 'run' and {NOT_ENDED_EARLY}", (
@@ -81,7 +81,7 @@ def table_view(search: str, columns: Sequence[str]) -> dict[str, object]:
 
     Args:
         search: Filter, such as "tags.kind = 'condition'".
-        columns: Such as "metrics.`eval/success_rate`"; the first orders the rows.
+        columns: Columns, such as "metrics.`eval/success_rate`"; the first orders the rows.
     """
     order = {"orderByKey": columns[0], "orderByAsc": False}
     return {"searchFilter": search, **order, "selectedColumns": list(columns)}
@@ -99,7 +99,7 @@ def chart_view(search: str, metrics: Sequence[str]) -> dict[str, object]:
         }
         for metric in metrics
     ]  # fmt: skip
-    # In the order of time, MLflow would show the runs' parents, with the runs folded below.
+    # In order of time, MLflow would show the parent runs, with these runs folded below.
     order = {"orderByKey": f"metrics.`{metrics[0]}`" if metrics else "", "orderByAsc": False}
     return {
         "searchFilter": search, **order, "compareRunCharts": cards, "compareRunSections": [section],
@@ -147,13 +147,13 @@ class Page:
     """The content of a run's page.
 
     Attributes:
-        experiment_id: Of MLflow.
-        run_id: Of MLflow.
+        experiment_id: MLflow's id of the experiment.
+        run_id: MLflow's id of the run.
         params: The resolved settings.
         tags: Job, commit, host and more.
         metrics: Newest values.
         files: Paths of all artifacts.
-        tables: Path -> text of those that are Markdown.
+        tables: Path -> text of the Markdown artifacts.
         views: Key -> name of the stored views of this run.
     """
 
@@ -168,7 +168,7 @@ class Page:
 
 
 def run_note(page: Page) -> str:
-    """Return the text at the top of a run's page: what it is, its metrics, pictures and tables."""
+    """Return the text at the top of a run's page: a summary, pictures and tables."""
     parts = [headline(page), links(page), *pictures(page), made(page)]
     used = sum(len(part) + 2 for part in parts)
     for path, text in page.tables.items():
@@ -181,7 +181,7 @@ def run_note(page: Page) -> str:
 
 
 def headline(page: Page) -> str:
-    """Return what the run is, and its main metrics."""
+    """Return a one-line summary of the run: job, experiment, seed and main metrics."""
     job = JOBS.get(page.tags.get("job", ""))
     what = job.summary if job else "A run"
     named = ", ".join(page.params[name] for name in ("exp", "budget") if name in page.params)
@@ -208,7 +208,7 @@ def links(page: Page) -> str:
 
 
 def pictures(page: Page) -> list[str]:
-    """Return the small pictures, the most telling first, each with a link to the large one."""
+    """Return the small pictures, the most important first, each with a link to the large one."""
     names = [path.removeprefix(f"{PREVIEWS}/") for path in page.files if path.startswith(f"{PREVIEWS}/")]
     return [
         f"![{name}](get-artifact?path={PREVIEWS}/{name}&run_uuid={page.run_id})\n"
@@ -223,7 +223,7 @@ def _place(name: str) -> tuple[int, str]:
 
 
 def made(page: Page) -> str:
-    """Return commit, machine, and the fidelity asked and achieved."""
+    """Return commit, machine, and the requested and achieved event error."""
     tags = {name: page.tags.get(name, "-") for name in ("commit", "host", "cpus", "python")}
     asked = page.params.get("fidelity.tolerance", "-")
     text = "Commit `{commit}`, host `{host}` ({cpus} CPUs), Python {python}. ".format(**tags)
@@ -233,7 +233,7 @@ def made(page: Page) -> str:
 
 
 def preview(picture: bytes) -> Image.Image:
-    """Return a picture no wider than a run's page."""
+    """Return a copy of a picture that is no wider than a run's page."""
     image = Image.open(io.BytesIO(picture)).convert("RGB")
     image.thumbnail((PAGE_WIDTH, 10 * PAGE_WIDTH))
     return image

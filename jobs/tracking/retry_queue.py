@@ -1,4 +1,4 @@
-"""Metrics that the tracking store has not taken yet: they wait in the run folder until it answers again."""
+"""Metrics that the tracking store has not accepted yet; they wait in the run folder until it answers."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -8,8 +8,8 @@ from typing import TypedDict
 
 from jobs.run.files import append_json_lines, json_lines, read_json_lines, write_atomic
 
-RETRY_AFTER_S = 30.0  # so that a store that does not answer does not hold up the work
-# How often MLflow's calls try a server that does not answer: variables that it reads at each call.
+RETRY_AFTER_S = 30.0  # so that a store that does not answer does not delay the job
+# Variables that MLflow reads at each call: how often it retries a server that does not answer.
 MANY_RETRIES = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "6"}  # 0, 4, 8, 16, 32 and 64 s apart
 NO_RETRIES = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "0", "MLFLOW_HTTP_REQUEST_TIMEOUT": "20"}
 
@@ -29,10 +29,10 @@ class LoggedStep(TypedDict):
 
 @dataclass
 class RetryQueue:
-    """The steps that one MLflow run still lacks, oldest first, as lines of JSON.
+    """The logged steps that one MLflow run still lacks, oldest first, as lines of JSON.
 
     Attributes:
-        file: Where they wait; it exists only while some do.
+        file: File of the waiting steps; it exists only while steps wait.
     """
 
     file: Path
@@ -49,7 +49,7 @@ class RetryQueue:
         return list({(row["step"], *sorted(row["metrics"])): row for row in rows}.values())
 
     def rows(self) -> list[LoggedStep]:
-        """Read the steps that wait; half a line that a kill left is dropped.
+        """Read the waiting steps; drop an incomplete last line that a kill left.
 
         Raises:
             RunError: A line is damaged.
@@ -57,12 +57,12 @@ class RetryQueue:
         return read_json_lines(self.file)
 
     def deliver(self, new: LoggedStep, send: Callable[[LoggedStep], None]) -> str | None:
-        """Send the steps that wait and the new one, in order; keep those that could not be sent.
+        """Send the waiting steps and the new one, in order; store the steps that could not be sent.
 
         Each step is also written to `record`, for another MLflow run of the same folder.
 
         Args:
-            new: The step to send after those that wait.
+            new: The step to send after the waiting ones.
             send: Sends one, or raises StoreUnavailable; may get the same step twice.
 
         Returns:

@@ -23,14 +23,14 @@ class ServedPolicy(PythonModel):
         """Read the policy that was registered."""
         self.loaded = load_policy(context.artifacts["policy"])
 
-    # Annotated as a table alone: any other annotation makes MLflow warn, or change the input.
+    # Annotated as a DataFrame only: with any other annotation MLflow warns or changes the input.
     def predict(
         self, context: Any, model_input: pd.DataFrame, params: dict[str, int] | None = None
     ) -> pd.DataFrame:
         """Return the likeliest action of each control step of one episode, with the logits of all actions.
 
         Args:
-            context: Of MLflow; unused.
+            context: MLflow's context; unused.
             model_input: Events as columns t [us since the episode's start], x, y [pixels], p (-1 or
                 +1), in time order; for a policy that sees luminance float32 (steps, H, W).
             params: `window_us`, the length of a control step [us].
@@ -40,7 +40,7 @@ class ServedPolicy(PythonModel):
             `action` and a logit for each of `Policy.action_names`.
 
         Raises:
-            ValueError: Events before the episode's start, or not in time order.
+            ValueError: Events are before the episode's start, or not in time order.
         """
         policy = Policy(self.loaded.networks, self.loaded.spec, self.loaded.encoder)
         names = self.loaded.action_names
@@ -55,11 +55,11 @@ class ServedPolicy(PythonModel):
 
 
 def control_steps(events: pd.DataFrame, window_us: int) -> Iterator[tuple[dict[str, np.ndarray], int, int]]:
-    """Yield the inputs of an episode's decisions: nothing at its start, then the events of each control step.
+    """Yield the inputs of an episode's decisions: no events at its start, then those of each control step.
 
     Yields:
-        Fields by name, start and length [us] of each step, up to that of the newest event; it has
-        the events with start < t <= start + window_us.
+        Event fields by name, start and length [us] of each step, up to the step of the newest event. A step
+        has the events with start < t <= start + window_us.
 
     Raises:
         ValueError: As `ServedPolicy.predict`.

@@ -15,17 +15,23 @@ from jobs.run.provenance import REPOSITORY
 SECTIONS = ("collect", "evae", "train", "eval", "sim", "perf", "sweep", "tune")
 MAX_METRICS = 40  # of one call; a page with hundreds of charts can be neither read nor drawn
 MAX_PARAM_CHARACTERS = 6000  # MLflow cuts longer values and only warns
-SCHEMES = ("sqlite:///", "http://", "https://", "postgresql", "mysql")  # of stores that MLflow keeps runs in
+SCHEMES = (
+    "sqlite:///",
+    "http://",
+    "https://",
+    "postgresql",
+    "mysql",
+)  # of addresses that MLflow supports for runs
 RULE = "must begin with sqlite:/// or http:// or https://"
 LOCAL_PAGE = "http://127.0.0.1:5000"
 
 
 def store_uri(config: Config) -> str:
-    """Return the store's address; a relative SQLite file lies in the folder that holds `runs_dir`.
+    """Return the store's address; a relative SQLite file lies in the parent folder of `runs_dir`.
 
     Raises:
-        ConfigError: If the address is of a kind that MLflow does not keep runs in, or one that
-            was written down here, without its password.
+        ConfigError: MLflow does not support runs at this kind of address, or the address is a copy
+            with a hidden password.
     """
     uri = config.tracking.uri
     if HIDDEN in uri:
@@ -43,7 +49,7 @@ def store_uri(config: Config) -> str:
 
 
 def quoted(path: str) -> str:
-    """Return a path for use in an address, where `%` and `?` have a meaning of their own."""
+    """Return a path for use in an address, where `%` and `?` have special meanings."""
     return path.replace("%", "%25").replace("?", "%3F")
 
 
@@ -58,12 +64,12 @@ def of_environment(values: dict[str, Any], words: Sequence[str], variables: Mapp
     """Let MLflow's own variables name the store and the experiment, unless the command line does.
 
     Args:
-        values: A composed configuration, which is changed.
+        values: A composed configuration, changed in place.
         words: The command line's words.
         variables: The environment.
 
     Returns:
-        A line for the user for each variable: that it is used, or that it is not, and why.
+        A line for the user for each variable that is set: that it is used, or why it is not.
     """
     lines = []
     for variable, name in (("MLFLOW_TRACKING_URI", "uri"), ("MLFLOW_EXPERIMENT_NAME", "experiment")):
@@ -91,7 +97,7 @@ def dashboard_command(uri: str) -> str:
 
 
 def server_command(uri: str) -> str:
-    """Return the server's command for any store: variables and words."""
+    """Return the shell command, with its variables, that serves any store."""
     lean = (
         "MLFLOW_SERVER_ENABLE_JOB_EXECUTION=false MLFLOW_DISABLE_TELEMETRY=true "
         "MLFLOW_ALLOW_PICKLE_DESERIALIZATION=false"
@@ -101,7 +107,7 @@ def server_command(uri: str) -> str:
 
 
 def check_metrics(metrics: Mapping[str, float]) -> dict[str, float]:
-    """Return the metrics as floats; `jobs.tracking.tracker.Tracker.log` says what is refused."""
+    """Return the metrics as floats; raise ValueError as `jobs.tracking.tracker.Tracker.log` describes."""
     values = {name: float(value) for name, value in metrics.items()}
     infinite = [f"{name} = {value}" for name, value in values.items() if math.isinf(value)]
     if infinite:
@@ -115,7 +121,7 @@ def check_metrics(metrics: Mapping[str, float]) -> dict[str, float]:
 
 
 def flatten(values: Mapping[str, object]) -> dict[str, str]:
-    """Return nested settings as `outer.inner` -> text; a text that MLflow would cut is refused."""
+    """Return nested settings as `outer.inner` -> text; raise ValueError for a text that MLflow would cut."""
     texts = {name: str(value) for name, value in flat(values)}
     for name, text in texts.items():
         if len(text) > MAX_PARAM_CHARACTERS:

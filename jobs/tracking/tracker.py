@@ -3,9 +3,9 @@
 One process creates the store (two at once break it). Only the driver writes, in batches: hundreds of
 single writes take seconds, a batch a few hundredths of one.
 
-A store that does not answer holds up no training: metrics wait in the run folder and are delivered
-when it answers again. All else (tables, plots, the runs themselves) waits for it two minutes, then
-the job stops; what it computed is in the run folder, and the same command records it from there.
+If the store does not answer, training continues: metrics wait in the run folder until the store
+answers again. All other calls (tables, plots, the runs themselves) wait two minutes, then the job
+stops. Its results are in the run folder, and the same command records them from there.
 """
 
 import contextlib
@@ -76,13 +76,13 @@ if TYPE_CHECKING:
 
 BATCH = 100  # MLflow's limit on parameters and on tags of one call
 KNOWN_RUNS = "tracking.json"  # in a run folder
-REMEDIES = {  # what SQLite says: what to do
+REMEDIES = {  # SQLite's message: remedy
     "disk is full": "make room there; ",
     "disk I/O error": "make room there; ",
     "malformed": "the file is damaged: move it away for a new one; ",
     "not a database": "the file is damaged: move it away for a new one; ",
 }
-REFUSALS = {  # what MLflow says, as a regular expression: what to do
+REFUSALS = {  # MLflow's message, as a regular expression: remedy
     "UNAUTHENTICATED|code 401": "set MLFLOW_TRACKING_USERNAME and MLFLOW_TRACKING_PASSWORD",
     "PERMISSION_DENIED|code 403": "ask its owner for permission, or name your own tracking.experiment=NAME",
     "active' state|INVALID_STATE": "restore it in MLflow's page, or name another tracking.experiment=NAME",
@@ -96,7 +96,7 @@ class TrackingError(RuntimeError):
 
 @dataclass(frozen=True)
 class Tracker:
-    """One MLflow run that is being written; `uri` is where, without a password."""
+    """One MLflow run that is being written; `uri` is the store's address without a password."""
 
     client: "MlflowClient"
     uri: str
@@ -113,11 +113,11 @@ class Tracker:
                 the tag `not_measured` names it.
 
         Raises:
-            ValueError: If a value is infinite (MLflow would store 1.8e308 without a word),
-                a name is in no known section, or there are more than `jobs.tracking.store.MAX_METRICS`.
+            ValueError: A value is infinite (MLflow would store 1.8e308 without a message), a name is
+                in no known section, or there are more metrics than `jobs.tracking.store.MAX_METRICS`.
         """
         values = check_metrics(metrics)
-        if not values:  # a job that continues may have nothing new to say
+        if not values:  # a resumed job may have nothing new to log
             return
         missing = sorted(name for name, value in values.items() if math.isnan(value))
         measured = {name: value for name, value in values.items() if name not in missing}
@@ -147,7 +147,7 @@ class Tracker:
             raise StoreUnavailable(_reason(error)) from error
 
     def log_once(self, step: int, metrics: Mapping[str, float]) -> None:
-        """Write only what the run does not hold yet: MLflow would draw a repeated point twice."""
+        """Write only the points that the run lacks: MLflow would draw a repeated point twice."""
         held = {
             (name, point.step, point.value)
             for name in self.client.get_run(self.run_id).data.metrics.keys() & metrics.keys()
@@ -179,11 +179,11 @@ class Tracker:
         self.client.log_text(self.run_id, text, name)
 
     def table(self, name: str, columns: Mapping[str, Sequence[object]]) -> None:
-        """Write a table as `name`.json, in place of an earlier one; values of its first column are unique."""
+        """Write a table as `name`.json, replacing an earlier one; values of the first column are unique."""
         written = {file.path for file in self.client.list_artifacts(self.run_id, str(Path(name).parent))}
         if f"{name}.json" not in written:
             self.client.log_table(self.run_id, dict(columns), f"{name}.json")
-        else:  # to which MLflow would append
+        else:  # `log_table` would append to it
             import pandas as pd  # takes half a second
 
             text = pd.DataFrame(dict(columns)).to_json(orient="split", index=False)
@@ -203,8 +203,8 @@ class Tracker:
 
         Args:
             key: Identity of the view; the same key replaces it.
-            name: What the menu calls it.
-            state: As `jobs.tracking.pages.table_view` or `chart_view` makes it.
+            name: Name in the menu.
+            state: State as returned by `jobs.tracking.pages.table_view` or `chart_view`.
         """
         tag, view = f"{VIEW_TAG}.{key}", packed_view(name, state, now_ms())
         old = json.loads(self.client.get_experiment(self.experiment_id).tags.get(tag, "{}"))
@@ -255,15 +255,15 @@ class Tracker:
 
 @contextlib.contextmanager
 def open_tracker(config: Config, folder: Run, key: str = "run") -> Iterator[Tracker]:
-    """Write to the MLflow run of a run folder: the one it had before, or a new one.
+    """Open the MLflow run of a run folder, the existing one or a new one; yield its tracker.
 
-    It ends as FINISHED, as FAILED after an exception, or as KILLED after Ctrl+C. Meanwhile no other
-    process can work in the run folder.
+    The MLflow run ends as FINISHED, as FAILED after an exception, or as KILLED after Ctrl+C. Until then
+    no other process can work in the run folder.
 
     Args:
-        config: Names the store and the experiment; its settings become parameters.
-        folder: The run folder; it remembers the MLflow run's id.
-        key: Which of the folder's MLflow runs.
+        config: Names the store and the experiment.
+        folder: The run folder; it stores the MLflow run's id, and its settings become parameters.
+        key: Name of the MLflow run among the folder's MLflow runs.
 
     Raises:
         RunError: Another process works in the run folder.
@@ -290,7 +290,7 @@ def open_tracker(config: Config, folder: Run, key: str = "run") -> Iterator[Trac
 
 @contextlib.contextmanager
 def _answering(uri: str, folder: Run) -> Iterator[None]:
-    """Stop with one clear error where the store does not answer, is full or is damaged."""
+    """Raise one clear TrackingError if the store does not answer, is full or is damaged."""
     from mlflow.exceptions import MlflowException
     from sqlalchemy.exc import DBAPIError
 
@@ -307,7 +307,7 @@ def _answering(uri: str, folder: Run) -> Iterator[None]:
 
 
 def _refusal(error: "MlflowException", uri: str, folder: Run) -> "TrackingError | None":
-    """Return what to say of a store that answers and refuses; None for a refusal without a known remedy."""
+    """Return the error for a store that answers with a refusal; None if no remedy is known."""
     said = redacted(" ".join(str(error).split())[:200])
     signs = (sign for sign in REFUSALS if re.search(sign, f"{error.error_code} {said}"))
     remedy = REFUSALS.get(next(signs, ""))
@@ -326,7 +326,7 @@ def _reason(error: Exception) -> str:
 
 @contextlib.contextmanager
 def _ended(tracker: Tracker) -> Iterator[None]:
-    """Set the run's status at the end of a block; deliver the metrics that wait before it is finished."""
+    """Set the run's status at the end of a block; deliver waiting metrics before the status FINISHED."""
     from mlflow.exceptions import MlflowException
 
     try:
@@ -350,7 +350,7 @@ def _terminate(tracker: Tracker, status: str) -> None:
 
 
 def _continue_or_create(near: Tracker, folder: Run, key: str, name: str, tags: dict[str, str]) -> Tracker:
-    """Return the MLflow run that the folder remembers under `key`, or create one that it will remember."""
+    """Return the MLflow run that the folder has stored under `key`, or create and store a new one."""
     from mlflow.exceptions import MlflowException
 
     known, slot = _known_runs(folder.path), _slot(near, key)
@@ -360,7 +360,7 @@ def _continue_or_create(near: Tracker, folder: Run, key: str, name: str, tags: d
             near.client.update_run(run_id, status="RUNNING")
             near.client.log_batch(run_id, tags=[])
             return dataclasses.replace(near, run_id=run_id)
-        except MlflowException as error:  # the run was deleted: begin a new one
+        except MlflowException as error:  # the run was deleted: create a new one
             if error.error_code in UNAVAILABLE:
                 raise
     run = near.client.create_run(near.experiment_id, now_ms(), tags=tags, run_name=name)
@@ -374,7 +374,7 @@ def _continue_or_create(near: Tracker, folder: Run, key: str, name: str, tags: d
 
 
 def _known_runs(path: Path) -> dict[str, str]:
-    """Return the MLflow runs that a run folder remembers: slot -> id."""
+    """Return the MLflow runs that a run folder has stored: slot -> id."""
     file = path / KNOWN_RUNS
     return read_json(file) if file.is_file() else {}
 
@@ -387,17 +387,17 @@ def _slot(near: Tracker, key: str) -> str:
 def open_store(uri: str, experiment: str, storage: str | None = None) -> tuple["MlflowClient", str]:
     """Return a client of the store and the experiment's id; create the store and the experiment if missing.
 
-    `storage` keeps a new experiment's artifacts; None: next to an SQLite file, or the server's own.
+    `storage` is where a new experiment's artifacts go; None: next to an SQLite file, or the server's place.
     """
     os.environ["MLFLOW_DISABLE_TELEMETRY"] = "true"
     os.environ["MLFLOW_ALLOW_PICKLE_DESERIALIZATION"] = "false"
-    os.environ["MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT"] = "true"  # with the password that is in it
+    os.environ["MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT"] = "true"  # it contains the password
     os.environ.setdefault("MLFLOW_LOGGING_LEVEL", "WARNING")
     os.environ.setdefault("MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR", "false")
     from mlflow import MlflowClient
 
     logging.getLogger("alembic").setLevel(logging.WARNING)
-    logging.getLogger("mlflow.store.db.utils").setLevel(logging.CRITICAL)  # tracebacks of what it raises
+    logging.getLogger("mlflow.store.db.utils").setLevel(logging.CRITICAL)  # it also logs what it raises
     name, file = quote(experiment, safe=""), sqlite_file(uri)
     if file is not None:
         lock, location = file.with_suffix(".lock"), (file.parent / "mlartifacts" / name).as_uri()
@@ -418,14 +418,14 @@ def open_store(uri: str, experiment: str, storage: str | None = None) -> tuple["
 
 
 def _deleted(uri: str, experiment: str, experiment_id: str) -> str:
-    """Return what to say of an experiment that was deleted in MLflow, with the command that restores it."""
+    """Return the message for an experiment that was deleted in MLflow, with the command that restores it."""
     restore = f"MLFLOW_TRACKING_URI={shlex.quote(uri)} mlflow experiments restore -x {experiment_id}"
     remedy = f"restore it with `{restore}`, or name another one: tracking.experiment={experiment}_2"
     return f"tracking.experiment: {experiment!r} was deleted in {uri}; {remedy}"
 
 
 def _remove_stray(uri: str, file: Path) -> None:
-    """Remove the empty folders that MLflow makes where an address, taken for a path, leads elsewhere."""
+    """Remove the empty folders that MLflow creates if it reads an address with escapes as a plain path."""
     taken = Path(uri.removeprefix("sqlite:///")).parent
     if taken != file.parent:
         with contextlib.suppress(OSError):
@@ -433,10 +433,10 @@ def _remove_stray(uri: str, file: Path) -> None:
 
 
 def _create_or_check(file: Path) -> None:
-    """Create an SQLite store, whole or not at all: MLflow cannot use one with half of its tables.
+    """Check an SQLite store, or create it whole or not at all: MLflow cannot use half of the tables.
 
     Raises:
-        TrackingError: There is one, and it is damaged.
+        TrackingError: The store is damaged.
     """
     from mlflow import MlflowClient
 

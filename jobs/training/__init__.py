@@ -1,1 +1,1 @@
-"""Making a policy: recordings, the event VAE, and PPO."""
+"""Training of policies: recordings, the event VAE, PPO, imitation and RLlib's algorithms."""

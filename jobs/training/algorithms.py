@@ -1,4 +1,4 @@
-"""What a training needs of an algorithm; `jobs.config.algorithms.ALGORITHMS` is the table of them."""
+"""The interface of a training algorithm; `jobs.config.algorithms.ALGORITHMS` lists the algorithms."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -13,14 +13,14 @@ from models.kinds import PolicySpec
 
 
 class Algorithm(NamedTuple):
-    """How RLlib trains a policy.
+    """The functions and metric names with which RLlib trains a policy.
 
     Attributes:
         build: (config, encoder file or None, file of initial networks or None) -> RLlib's `AlgorithmConfig`.
         trainable: config -> the class that Tune runs.
-        networks: (trained RLModule, spec) -> the policy's networks, as of `models.policy.networks.assemble`.
-        losses: Name in the tracker -> the learner's name, of the figures of an update that must be finite.
-        figures: The same, of figures that may be NaN.
+        networks: (trained RLModule, spec) -> the policy's networks, as in `models.policy.networks.assemble`.
+        losses: Name in the tracker -> the learner's name, for metrics of an update that must be finite.
+        figures: Like `losses`, for metrics that may be NaN.
     """
 
     build: Callable[[Config, Path | None, Path | None], Any]
@@ -37,5 +37,5 @@ def algorithm_of(config: Config) -> Algorithm:
 
 
 def build_algorithm(config: Config, encoder_path: Path | None = None, init: Path | None = None) -> Any:
-    """Return RLlib's configuration of an experiment's algorithm; arguments as of `Algorithm.build`."""
+    """Return RLlib's configuration of an experiment's algorithm; arguments as for `Algorithm.build`."""
     return algorithm_of(config).build(config, encoder_path, init)

@@ -1,7 +1,7 @@
-"""Choose among trainings of one experiment that differ in their seed: evaluate each under drawn faults.
+"""Choose among trainings of one experiment with different seeds by evaluating each under drawn faults.
 
-PPO's trainings differ more than recipes do. The corridors are those of the split `validation`, and the values
-of the conditions are drawn, so that no corridor and no level of a later evaluation decides.
+With PPO, seeds differ more than recipes do. The corridors are from the split `validation` and the values of
+the conditions are drawn, so the choice depends on no corridor and no level of a later evaluation.
 """
 
 import dataclasses
@@ -24,8 +24,8 @@ from jobs.run.files import read_json_lines, write_atomic, write_json
 from jobs.run.folder import Run
 from models.policy.policy import MANIFEST, read_policy_manifest
 
-CORRIDORS = 16  # of each condition, the same for all candidates
-DRAWS = 4  # of the values of a condition, each in as many of its corridors
+CORRIDORS = 16  # per condition, the same for all candidates
+DRAWS = 4  # of a condition's values; its corridors are divided evenly among them
 TEXTURES = ["checker", "stripes", "rings", "noise"]
 FAULTS: tuple[dict[str, Any], ...] = (
     {},
@@ -39,30 +39,30 @@ FAULTS: tuple[dict[str, Any], ...] = (
      "env.layout.ground_texture.contrast": {"low": 0.1, "high": 0.6},
      "env.layout.wall_texture.contrast": {"low": 0.1, "high": 0.6},
      "env.layout.wall_albedo": 0.6,
-     "fidelity.tolerance": 0.5, "fidelity.samples": 1},  # patterns are dear to draw
+     "fidelity.tolerance": 0.5, "fidelity.samples": 1},  # textures are slow to render
 )  # fmt: skip
 
 
 def candidate_seeds(config: Config) -> list[int]:
-    """Return the seeds of the trainings to choose among; two runs of other seeds share none."""
+    """Return the seeds of a run's candidates; runs with other seeds and as many candidates share none."""
     count = config.train.candidates
     return [config.seed * count + place for place in range(count)]
 
 
 def candidate_run(folder: Run, seed: int) -> Run:
-    """Return the folder of a candidate's training, in that of its run, with its configuration."""
+    """Return folder and configuration of a candidate's training; the folder lies in the run folder."""
     train = dataclasses.replace(folder.config.train, candidates=1)
     own = dataclasses.replace(folder.config, seed=seed, train=train)
     return Run(folder.path / "candidates" / f"{folder.path.name}-c{seed}", own)
 
 
 def validation_tasks(policy: EvaluatedPolicy, action: str, trained: EnvConfig) -> list[EvaluationTask]:
-    """Return the tasks of a candidate: `FAULTS` that its simulation can have, in validation corridors.
+    """Return a candidate's tasks: the `FAULTS` that its simulation supports, in validation corridors.
 
     Args:
         policy: The candidate.
         action: How it chooses its actions.
-        trained: The simulation of its training, from which the others are drawn.
+        trained: The simulation of its training, which the drawn conditions modify.
     """
     env = dataclasses.replace(trained, split="validation")
     tasks = []
@@ -78,9 +78,9 @@ def validation_tasks(policy: EvaluatedPolicy, action: str, trained: EnvConfig) -
 
 
 def validate(folder: Run, policies: Mapping[int, Path]) -> dict[int, tuple[float, float]]:
-    """Return seed -> success [-] and mean distance [m] of each candidate in all of its tasks.
+    """Evaluate all candidates; return seed -> success rate [-] and mean distance [m] over all tasks.
 
-    Episodes are kept in the run folder: a stopped validation continues.
+    Episodes are stored in the run folder, so a stopped validation resumes.
 
     Raises:
         RuntimeError: A task failed.
@@ -107,14 +107,14 @@ def _mean(episodes: Sequence[np.ndarray]) -> tuple[float, float]:
 
 
 def best_of(rates: Mapping[int, tuple[float, float]]) -> int:
-    """Return the seed that succeeds most; of equal ones the one that gets farther, then the first."""
+    """Return the seed with the highest success rate; ties go to the larger distance, then the lower seed."""
     return max(rates, key=lambda seed: (*rates[seed], -seed))
 
 
 def take(folder: Run, best: Run, rates: Mapping[int, tuple[float, float]]) -> list[dict[str, float]]:
-    """Make a candidate the policy of its run; return the rows of its learning curve.
+    """Copy a candidate's policy into its run; return the rows of its learning curve.
 
-    The manifest keeps the run's own seed, and says which seeds there were and how often each succeeded.
+    The manifest has the run's own seed, and the success rates of all candidates.
     """
     manifest = read_policy_manifest(best.policy / MANIFEST)
     chosen = {
@@ -133,7 +133,7 @@ def take(folder: Run, best: Run, rates: Mapping[int, tuple[float, float]]) -> li
 
 
 def show(rates: Mapping[int, tuple[float, float]], best: int) -> None:
-    """Print how each candidate did, and which is taken."""
+    """Print the results of each candidate and which one was chosen."""
     rows = [
         (str(seed), f"{100 * rate:.0f}", f"{far:.0f}", "taken" if seed == best else "")
         for seed, (rate, far) in rates.items()

@@ -1,11 +1,11 @@
-"""Record the events of episodes in training corridors, with random actions and by a policy if one is named.
+"""Record the events of episodes in training corridors, with random actions and, if named, a policy.
 
-Recordings of real cameras (`collect.recordings`) are data beside the episodes, or instead of them.
+Recordings of real cameras (`collect.recordings`) supplement the episodes or replace them.
 
 Run: python -m platform.launch +exp=collect
 Expect: about 3,000 control steps per second on one core; `data/train.h5` and
-`data/validation.h5` in the run folder, each of whole episodes that no other file shares. Where the encoder
-learns to denoise, `train_true.h5` and `validation_true.h5` hold the same steps before the sensor's faults.
+`data/validation.h5` in the run folder, whole episodes that differ between the two files. If the encoder
+learns to denoise, `train_true.h5` and `validation_true.h5` have the same steps before the sensor's faults.
 """
 
 import dataclasses
@@ -37,12 +37,12 @@ from jobs.training.real_recordings import GAP_US, Recorded, no_episodes, read_re
 from models.encoder.evae import SECTORS
 
 MEAN_HOLD_M = 2.0
-PROXIMITY_ONE = 65_535  # the proximity 1 in a recording
-POLICY_EPISODES = 10**6  # number of a policy's first episode: corridors that no random one came to
+PROXIMITY_ONE = 65_535  # stored value of proximity 1
+POLICY_EPISODES = 10**6  # number of a policy's first episode; random actions get other corridors
 
 
 def run(config: Config) -> dict[str, float]:
-    """Collect the data sets of a run; return its folder."""
+    """Collect the data sets of a run; return their metrics."""
     check_collect(locate_run(config))
     folder = open_run(config)
     with open_tracker(folder.config, folder) as tracker:
@@ -50,7 +50,7 @@ def run(config: Config) -> dict[str, float]:
 
 
 def collect(folder: Run, tracker: Tracker) -> dict[str, float]:
-    """Write the training and validation recordings of a run, unless they are there already."""
+    """Write the training and validation recordings of a run if they are missing; return their metrics."""
     done = finished(folder, "collect")
     if done is not None:
         return done
@@ -83,7 +83,7 @@ def collect(folder: Run, tracker: Tracker) -> dict[str, float]:
                 write_recording(data_file(folder, name), one)
             figures[f"collect/{split}_events"] = len(made[0].events)
             figures[f"collect/{split}_episodes"] = made[0].about["flights"]
-            del made  # gigabytes, before those of the next split are made
+            del made  # frees gigabytes before the next split is recorded
     seal(folder.data)
     if config.collect.scenes:
         figures |= report_event_error(dataclasses.replace(config.env, scene=config.collect.scenes[0]))
@@ -92,15 +92,15 @@ def collect(folder: Run, tracker: Tracker) -> dict[str, float]:
 
 
 def data_file(folder: Run, split: str) -> Path:
-    """Return where the recording of a split lives in a run folder."""
+    """Return the path of a split's recording in a run folder."""
     return folder.data / f"{split}.h5"
 
 
 def check_collect(folder: Run) -> tuple[Path | None, list[dict[str, Recorded]]]:
-    """Return the policy and the recordings that a run still has to collect; none if it has collected.
+    """Return the policy and the recordings that a run has yet to collect from; None and [] once collected.
 
     Raises:
-        ConfigError: `collect.policy` or `collect.recordings` names one that does not fit.
+        ConfigError: `collect.policy` or `collect.recordings` names a file that does not fit.
     """
     policy, config = check_policy(folder), folder.config
     if finished(folder, "collect") is not None:
@@ -118,15 +118,15 @@ def check_collect(folder: Run) -> tuple[Path | None, list[dict[str, Recorded]]]:
 
 
 def knows_truth(config: Config) -> bool:
-    """Whether the encoder of an experiment learns from what only the simulator knows."""
+    """Whether only the simulator knows the encoder's target (proximity)."""
     return getattr(config.model, "target", None) == "proximity"
 
 
 def check_pictures(config: Config) -> None:
-    """Check that the encoder of a run decodes pictures of events, for studies that compare these.
+    """Check that the encoder of a run decodes event pictures, for studies that compare event pictures.
 
     Raises:
-        ConfigError: It decodes what only the simulator knows.
+        ConfigError: The encoder decodes proximity.
     """
     if knows_truth(locate_run(config).config):
         rule = "must be a picture of events for this study: occupancy, signed, aged or counts"
@@ -134,15 +134,15 @@ def check_pictures(config: Config) -> None:
 
 
 def learns_to_denoise(config: Config) -> bool:
-    """Whether the encoder decodes events as they were before the faults; proximity has none."""
+    """Whether the encoder decodes the events before the sensor's faults; never if it decodes proximity."""
     return config.pretrain.denoise and not knows_truth(config)
 
 
 def check_policy(folder: Run) -> Path | None:
-    """Return the folder of the policy that a run still has to record episodes of; None if there is none.
+    """Return the folder of the policy whose episodes a run has yet to record; None if there is none.
 
     Raises:
-        ConfigError: `collect.policy` names none, or one for another sensor.
+        ConfigError: `collect.policy` names no policy, or one for another sensor.
     """
     named = folder.config.collect.policy
     if named is None or finished(folder, "collect") is not None:
@@ -165,20 +165,20 @@ def record(
     Args:
         shares: Environment and number of control steps [-], one pair per scene.
         seed: Seed of corridors and actions.
-        advance: Told the number of steps after each episode.
+        advance: Called with the number of steps after each episode.
         policy: Folder of a policy that acts in a share of the steps, in whole episodes of its own,
-            sampling its actions as in training; None: all are random.
-        policy_share: That share, 0..1.
-        conditions: Of which each episode draws one.
-        keep_true: Whether the events are also kept as they were before the faults of the sensor.
-        sectors: Of the field of view, in which the proximity of obstacles is kept at the end of each step;
-            0: it is not.
+            sampling its actions as in training; None: all actions are random.
+        policy_share: The policy's share of the steps, 0..1.
+        conditions: Conditions of which each episode draws one.
+        keep_true: Whether to record the events before the sensor's faults as well.
+        sectors: Number of sectors of the field of view in which to record the proximity of obstacles at the
+            end of each step; 0: proximity is not recorded.
 
     Returns:
-        Events of all episodes, `GAP_US` apart, as they are observed; with `keep_true` those before the faults
-        in a second recording. `index` holds `step_t_us`, `step_end_us` and `step_flight` (start and end [us]
-        and episode number of each step), and with `sectors` `step_proximity`, uint16 (steps * sectors,), in
-        parts of `PROXIMITY_ONE`.
+        The observed events of all episodes, `GAP_US` apart; with `keep_true` a second recording of the events
+        before the faults. `index` has `step_t_us`, `step_end_us` and `step_flight` (start and end [us] and
+        episode number of each step) and, with `sectors`, `step_proximity`, uint16 (steps * sectors,), in
+        units of 1 / `PROXIMITY_ONE`.
     """
     tape, near = _Tape([EventBlock() for _ in range(1 + keep_true)]), list[np.ndarray]()
     for config, num_steps, by_policy in stints(shares, policy, policy_share):
@@ -218,22 +218,22 @@ def record(
 
 
 class EventBlock:
-    """Events in one array that grows in place: so large that the system has it back when it is gone.
+    """Events in one array that grows in place, so large that its memory returns to the system when freed.
 
-    Thousands of episodes' arrays would stay with the process as long as anything small lies between them.
+    Thousands of arrays, one per episode, would stay allocated while any small object lies between them.
     """
 
     def __init__(self) -> None:
-        """Begin without events."""
+        """Start without events."""
         self._room, self._size = np.empty(1 << 16, EVENT), 0
 
     @property
     def events(self) -> np.ndarray:
-        """Return all so far; none may be added while this is in use."""
+        """Return all events so far as a view; do not add events while it is in use."""
         return self._room[: self._size]
 
     def add(self, parts: Sequence[np.ndarray], clock_us: int) -> None:
-        """Append the EVENT arrays of an episode that began at `clock_us`."""
+        """Append the EVENT arrays of an episode that starts at `clock_us`."""
         size = self._size + sum(map(len, parts))
         if size > len(self._room):
             self._room.resize(max(size, 5 * len(self._room) // 4), refcheck=False)
@@ -249,7 +249,7 @@ class _Tape:
     """Episodes one after the other on one clock: their events; start, end and episode of each step.
 
     Attributes:
-        blocks: Of the events as observed, and, if there is a second, of those before the faults.
+        blocks: The observed events and, in a second block if there is one, the events before the faults.
     """
 
     blocks: list[EventBlock]
@@ -260,7 +260,7 @@ class _Tape:
     def add(
         self, events: Sequence[np.ndarray], true_events: Sequence[np.ndarray], ends_us: Sequence[int]
     ) -> None:
-        """Append an episode: the events of each step, and when it ended [us since the episode's start]."""
+        """Append an episode: the events and the end [us since the episode's start] of each step."""
         for block, parts in zip(self.blocks, (events, true_events), strict=False):
             block.add(parts, self.clock_us)
         for start, end in zip([0, *ends_us], ends_us, strict=False):
@@ -270,14 +270,14 @@ class _Tape:
 
 
 def _shown_to(agent: Agent) -> Observation:
-    """Return what an environment observes; it has events also for an agent that sees none."""
+    """Return the observation of an agent's environment; "events" for an agent that sees no events."""
     return "events" if agent.observation in WITHOUT_EVENTS else agent.observation
 
 
 def stints(
     shares: Sequence[tuple[EnvConfig, int]], policy: Path | None, policy_share: float
 ) -> list[tuple[EnvConfig, int, Path | None]]:
-    """Return environment, control steps and policy of each share; the policy is None for random."""
+    """Split each share into environment, control steps and policy; the policy is None for random actions."""
     parts = []
     for config, num_steps in shares:
         of_policy = 0 if policy is None else round(policy_share * num_steps)
@@ -286,7 +286,7 @@ def stints(
 
 
 class HoldingAgent:
-    """Any action with the same probability, held for 2 m on average; for one episode at a time."""
+    """Draws actions uniformly and holds each for 2 m on average; for one episode at a time."""
 
     observation: Observation = "events"
 
@@ -316,9 +316,8 @@ def run_episode(
     """Run one episode of an environment and an agent after their reset; `started` is the reset's result.
 
     Returns:
-        The events of each step as they are observed, those before the sensor's faults, the time at which
-        each step ended [us since the start], and then the proximity of obstacles in `sectors`, if any,
-        as `record` has it.
+        For each step: the observed events, the events before the sensor's faults, the end of the step
+        [us since the start] and, with `sectors`, the proximity of obstacles as in `record`.
     """
     events, true_events, ends_us, near = [], [], [], []
     for end_us in steps_of(env, agent, started, most_steps):
@@ -333,7 +332,7 @@ def run_episode(
 
 
 def at_rest(scene: Scene, bodies: np.ndarray) -> Scene:
-    """Return a scene in which bodies OBSTACLE (N,) stand instead of what moves."""
+    """Return a scene whose moving bodies are replaced by standing ones, `bodies` OBSTACLE (N,)."""
     if not len(bodies):
         return scene
     standing = np.concatenate([scene.obstacles, bodies])
@@ -343,10 +342,10 @@ def at_rest(scene: Scene, bodies: np.ndarray) -> Scene:
 def steps_of(
     env: CorridorEnv, agent: Agent, started: tuple[np.ndarray, Info], most_steps: int
 ) -> Iterator[int]:
-    """Return the steps of such an episode, to look at the environment after each one.
+    """Run the episode of `run_episode` step by step; the caller can read the environment after each step.
 
     Yields:
-        The time at which the step ended [us since the start].
+        The end of the step [us since the start].
     """
     observation, info = started
     for _ in range(most_steps):

@@ -1,7 +1,7 @@
-"""What a training begins from: a pretrained encoder, or all of a policy that was trained before.
+"""Inputs of a training: a pretrained encoder, or a complete policy that was trained before.
 
-`train.init` names such a policy. The run folder keeps a copy, from which a stopped training goes on even if
-the original is gone; the encoder is the policy's, so that nothing is collected and pretrained.
+`train.init` names such a policy. The run folder stores a copy, so a stopped training resumes even if the
+original is gone. The training uses the policy's encoder; nothing is collected or pretrained.
 """
 
 from pathlib import Path
@@ -20,10 +20,11 @@ from models.policy.policy import ENCODER, ENCODER_FILES, MANIFEST, NETWORKS, Pol
 
 
 def check_inputs(config: Config) -> None:
-    """Check all that a training begins from, and its GPU, before anything is made.
+    """Check the inputs of a training, its CPUs and its GPU before the run writes anything.
 
     Raises:
-        ConfigError: `train.init` names no policy, or one that does not fit; or as `check_sources`.
+        ConfigError: `train.init` names no policy, or one that does not fit; or `check_sources` or
+            `check_cpus` fails.
     """
     check_sources(config)
     check_cpus(config)
@@ -33,10 +34,10 @@ def check_inputs(config: Config) -> None:
 
 
 def check_cpus(config: Config) -> None:
-    """Check that a local Ray has a CPU for each env runner: Tune would wait for them forever.
+    """Check that a local Ray has a CPU for each env runner; otherwise Tune would wait forever.
 
     Raises:
-        ConfigError: It has not.
+        ConfigError: There are more env runners than CPUs.
     """
     needed, cpus = config.algo.num_env_runners, config.cluster.num_cpus or get_num_cpus()
     if config.cluster.name == "local" and needed > cpus:
@@ -45,7 +46,7 @@ def check_cpus(config: Config) -> None:
 
 
 def prepare_inputs(folder: Run, tracker: Tracker) -> Path | None:
-    """Copy the policy to begin from, or make the encoder; the encoder's file, or None without one."""
+    """Copy the initial policy or create the encoder; return the encoder file, None if there is none."""
     if folder.config.train.init is None:
         return prepare_encoder(folder, tracker)
     source, policy = check_init(folder)
@@ -53,17 +54,18 @@ def prepare_inputs(folder: Run, tracker: Tracker) -> Path | None:
         parent = tracker.of(source.parent).run_id
         lineage = {"init": source, "init_sha256": policy.manifest["sha256"][NETWORKS]}
         tracker.tags(lineage | ({"init_run": parent} if parent != tracker.run_id else {}))
-        names = (*(ENCODER_FILES if policy.spec.frozen else ()), NETWORKS, MANIFEST)  # the last one seals it
+        # The manifest is last: a copy with a manifest is complete.
+        names = (*(ENCODER_FILES if policy.spec.frozen else ()), NETWORKS, MANIFEST)
         for name in names:
             write_atomic(folder.init / name, (source / name).read_bytes())
     return folder.init / ENCODER if policy.spec.frozen else None
 
 
 def check_init(folder: Run) -> tuple[Path, Policy]:
-    """Return folder and policy that a run begins from; the folder is the run's own copy if it has one.
+    """Return folder and policy from which a run starts; the folder is the run's own copy if it has one.
 
     Raises:
-        ConfigError: `train.init` names none, or one of other settings, of another sensor or encoder.
+        ConfigError: `train.init` names no policy, or one with another model, sensor or encoder.
     """
     config, kept = folder.config, str(folder.init)
     name = kept if named_policy(kept) else str(config.train.init)

@@ -1,4 +1,4 @@
-"""The policy of a training: what its networks are built from, and what its manifest records."""
+"""The policy of a training: the specification of its networks, its manifest, and its encoder."""
 
 import dataclasses
 from pathlib import Path
@@ -16,15 +16,15 @@ from models.kinds import KINDS, PolicySpec
 
 
 def policy_spec(config: Config) -> PolicySpec:
-    """Return what the policy's networks are built from."""
+    """Return the specification of the policy's networks."""
     camera, actions = config.env.camera, make_dynamics(config.env).action_space
-    if not isinstance(actions, Discrete):  # `jobs.config` refuses such vehicles
+    if not isinstance(actions, Discrete):  # `jobs.config` rejects such vehicles
         raise ValueError(f"a policy chooses among discrete actions, got {actions}")
     return PolicySpec(config.model, camera.width, camera.height, int(actions.n))
 
 
 def policy_about(config: Config) -> dict[str, object]:
-    """Return what a policy's manifest records of its environment and training, beside its `policy_spec`."""
+    """Return what a policy's manifest states about environment and training, besides its `policy_spec`."""
     sensor, commands = sensor_settings(config.env), make_dynamics(config.env).commands
     own = {name: getattr(config.env, name) for name in ("action_delay_ms", "velocity_noise_mps")}
     return {
@@ -49,12 +49,12 @@ def pretrained_encoder(config: Config, path: str | Path | None) -> tuple[str | P
     """Return the encoder file with its manifest; None for a policy without one.
 
     Raises:
-        ConfigError: It was made for another sensor, or for another model than the one to fine-tune.
-        RunError: It is damaged.
-        ValueError: A policy that needs one got none, or the other way round.
+        ConfigError: The encoder was trained for another sensor, or is another model than to be fine-tuned.
+        RunError: The encoder file is damaged.
+        ValueError: A policy that needs an encoder got none, or a policy without one got a file.
     """
     name, needed = config.model.name, KINDS[config.model.name].encoder
-    if policy_spec(config).finetuned and config.train.init is not None:  # its networks hold their encoder
+    if policy_spec(config).finetuned and config.train.init is not None:  # in its networks
         return None
     if needed != (path is not None):
         raise ValueError(f"encoder_path must be {'a file' if needed else 'None'} for {name}, got {path!r}")

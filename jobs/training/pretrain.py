@@ -45,18 +45,18 @@ from models.encoder.weights import EncoderFileError, load_encoder, save_encoder
 from models.kinds import KINDS, EvaeSettings, PolicySpec
 
 Window = tuple[np.ndarray, int, int]  # events, start_us, window_us
-HeldOut = dict[str, tuple[EventBatch, Tensor]]  # windows by their length, and what is decoded from each
+HeldOut = dict[str, tuple[EventBatch, Tensor]]  # windows by their length, with the decoder's targets
 
 ENCODER, CHECKPOINTS = "encoder.safetensors", "checkpoint-*.pt"
-# On any machine, so that its cores change no byte; encoders of bytestreams have those of one thread.
+# Fixed, so that the number of cores changes no byte. A bytestream's encoder has the same bytes with 1 thread.
 THREADS = 2
-CHECKPOINTS_KEPT = 2  # should the newest be damaged
+CHECKPOINTS_KEPT = 2  # the second serves if the newest is damaged
 MIN_STEPS, MAX_STEPS = 0.5, 8.0
 VALIDATION_WINDOWS = 200
 PICTURE_WINDOWS = 8
 MANY = 10**9  # events
 SPLITS = ("train", "validation")
-NEVER_US = 1 << 62  # when the episode after the last one begins
+NEVER_US = 1 << 62  # start of the episode after the last one
 COLLAPSED = (
     "the latent says nothing of its window (posterior collapse), a policy would see nothing; "
     "if more iterations do not help, take a smaller pretrain.beta or pretrain.beta_schedule=constant"
@@ -64,10 +64,10 @@ COLLAPSED = (
 
 
 def run(config: Config) -> dict[str, float]:
-    """Collect if there is no data yet, then train the event VAE; return its figures.
+    """Collect data if there is none yet, then train the event VAE; return its metrics.
 
     Raises:
-        ConfigError: The policy has no event VAE, or as `check_sources`.
+        ConfigError: The policy has no event VAE, or `check_sources` fails.
     """
     name = locate_run(config).config.model.name
     if not KINDS[name].encoder:
@@ -80,11 +80,11 @@ def run(config: Config) -> dict[str, float]:
 
 
 def check_sources(config: Config) -> None:
-    """Check the files that collecting and pretraining begin from, and the GPU, before anything is made.
+    """Check the input files of collecting and pretraining, and the GPU, before the run writes anything.
 
     Raises:
-        ConfigError: `collect.policy`, `collect.recordings` or `pretrain.encoder` names one that does not fit;
-            or torch sees no GPU for `cluster.device=cuda`.
+        ConfigError: `collect.policy`, `collect.recordings` or `pretrain.encoder` names a file that does not
+            fit; or torch sees no GPU for `cluster.device=cuda`.
     """
     if config.cluster.device == "cuda" and not torch.cuda.is_available():
         rule = "cuda needs a GPU and a build of torch with CUDA, and torch sees no GPU here; take cpu"
@@ -96,10 +96,10 @@ def check_sources(config: Config) -> None:
 
 
 def initial_state(folder: Run) -> dict[str, torch.Tensor] | None:
-    """Return the weights that a run's event VAE still has to begin from; None for random ones.
+    """Return the initial weights of a run's event VAE; None for random ones, or if training has started.
 
     Raises:
-        ConfigError: `pretrain.encoder` names no encoder, or one of another model or without a decoder.
+        ConfigError: `pretrain.encoder` names no encoder, or one with other settings or without a decoder.
     """
     named, config = folder.config.pretrain.encoder, folder.config
     if named is None or checkpoints(folder.encoder) or finished(folder, "pretrain") is not None:
@@ -121,7 +121,7 @@ def initial_state(folder: Run) -> dict[str, torch.Tensor] | None:
 
 
 def prepare_encoder(folder: Run, tracker: Tracker) -> Path | None:
-    """Collect and pretrain what is not there yet; the encoder file, or None if the policy has no encoder."""
+    """Collect and pretrain if not done yet; return the encoder file, None for a policy without an encoder."""
     if not KINDS[folder.config.model.name].encoder:
         return None
     collect(folder, tracker)
@@ -142,7 +142,7 @@ def pretrain(folder: Run, tracker: Tracker) -> dict[str, float]:
     seed, device = (config.seed, 2), config.cluster.device
     training = EvaeTraining(evae_settings(config), train, settings, seed, true, device)
     evae, first = training.evae, restore(folder.encoder, training)
-    begin = initial_state(folder)  # none where a checkpoint was restored; a damaged one is gone by now
+    begin = initial_state(folder)  # None if a checkpoint was restored; `restore` has deleted damaged ones
     if begin is not None:
         evae.load_state_dict(begin)
     held_out = held_out_windows(validation, settings, evae.settings, validation_true)
@@ -171,16 +171,16 @@ def pretrain(folder: Run, tracker: Tracker) -> dict[str, float]:
 
 
 def read_split(folder: Run, split: str, denoise: bool) -> tuple[Recording, Recording | None]:
-    """Return what was recorded of a split, and, to `denoise`, what is to be decoded from it."""
+    """Return the recording of a split and, with `denoise`, its events before the faults (else None)."""
     seen = read_recording(data_file(folder, split))
     return seen, read_recording(data_file(folder, f"{split}_true")) if denoise else None
 
 
 def check_data(folder: Run) -> None:
-    """Check that the recordings of a run are those that were collected.
+    """Check that a run's recordings are unchanged since they were collected.
 
     Raises:
-        RunError: They are not.
+        RunError: A file is damaged.
     """
     reason = damage(folder.data)
     if reason not in (None, UNSEALED):  # older versions did not seal them
@@ -191,14 +191,14 @@ def check_data(folder: Run) -> None:
 
 
 class EvaeTraining:
-    """A training of an event VAE in progress; each step changes the model, the optimiser and the stream.
+    """An event VAE in training; each step changes the model, the optimiser and the generator.
 
     Attributes:
         evae: The model.
-        optimizer: Over its parameters.
-        recording: What windows are sampled from.
-        true: What is decoded, events of the same time; None: those of the window.
-        settings: Of the training.
+        optimizer: Adam over the model's parameters.
+        recording: Recording from which windows are sampled.
+        true: Recording of the same time from which the targets are made; None: the sampled windows.
+        settings: Settings of the pretraining.
         rng: Draws the windows and the noise of the latent.
     """
 
@@ -211,12 +211,12 @@ class EvaeTraining:
         true: Recording | None = None,
         device: str = "cpu",
     ) -> None:
-        """Begin from random weights; `seed`: the experiment's, and the number of the stream.
+        """Start from random weights; `seed` is the experiment's seed and the number of the random stream.
 
-        On any `device`, as torch names it, it begins from the same weights and sees the same windows.
+        Initial weights and windows are the same on every torch `device`.
 
         Raises:
-            ConfigError: Windows are to hold a number of events, and the recording has none.
+            ConfigError: `pretrain.windows` is "count" and the recording has no events.
         """
         if settings.windows == "count" and not len(recording.events):
             rule = (
@@ -243,7 +243,7 @@ class EvaeTraining:
 
 
 def on_processor(evae: EventVAE) -> EventVAE:
-    """Return the model itself, or a copy of one that is on a GPU."""
+    """Return the model on the CPU: itself, or a copy if it is on a GPU."""
     return evae if evae.decoder[0].weight.device.type == "cpu" else copy.deepcopy(evae).cpu()
 
 
@@ -254,7 +254,7 @@ def evae_settings(config: Config) -> EvaeSettings:
 
 
 def beta(settings: PretrainConfig, iteration: int) -> float:
-    """Return weight of the KL divergence at an iteration (appendix B.2, or a constant)."""
+    """Return the weight of the KL divergence at an iteration (appendix B.2, or a constant)."""
     if settings.beta_schedule == "appendix":
         return appendix_beta(iteration)
     return settings.beta
@@ -265,9 +265,9 @@ def sample_windows(
 ) -> list[Window]:
     """Draw event windows that never cross from one episode into the next.
 
-    "count" windows hold `window_events` events from a random index on (appendix B.2). "mixed"
-    windows last between half a control step and eight, so that the encoder knows the short,
-    sparse and empty windows of control at any rate as well as long ones.
+    "count" windows have `window_events` events, starting at a random index (appendix B.2). "mixed"
+    windows last between half a control step and eight, so that the encoder learns the short,
+    sparse and empty windows of any control rate as well as long ones.
 
     Returns:
         (events, start_us, window_us) each; every event has start_us < t <= start_us + window_us.
@@ -307,7 +307,10 @@ def cut_window(recording: Recording, start_us: int, window_us: int, most_events:
 
 
 def true_windows(true: Recording, windows: Sequence[Window], most_events: int) -> list[Window]:
-    """Return what a recording holds of the time of windows that have `most_events` at most, the newest."""
+    """Return the events of a recording in the time of given windows.
+
+    A window with `most_events` was cut to its newest events, so its time starts at its first event.
+    """
     found = []
     for events, start_us, window_us in windows:
         first_us = start_us if len(events) < most_events else int(events["t"][0]) - 1
@@ -324,15 +327,16 @@ def decoded(
     true: Recording | None,
     most_events: int,
 ) -> Tensor:
-    """Return what a model is to decode from windows, float32 (B, outputs): recorded, or of `event_targets`.
+    """Return the decoder's targets of windows, float32 (B, outputs): recorded proximity or `event_targets`.
 
     Args:
-        target: Of the model. "proximity" is that at the end of the control step nearest to a window's end.
-        recording: Where the windows are from.
-        windows: Which.
-        batch: The same, as a batch.
-        true: Events of the same time, which pictures are made of; None: those of the windows.
-        most_events: Of a window.
+        target: Target of the model. "proximity" is recorded at the end of each control step; a window gets
+            the value nearest to its end.
+        recording: Recording from which the windows were cut.
+        windows: The windows.
+        batch: The same windows as a batch.
+        true: Recording of the same time from which pictures are made; None: the windows themselves.
+        most_events: Largest number of events in a window.
     """
     if target == "proximity":
         if "step_proximity" not in recording.index:
@@ -352,7 +356,7 @@ def decoded(
 def held_out_windows(
     recording: Recording, settings: PretrainConfig, model: EvaeSettings, true: Recording | None = None
 ) -> HeldOut:
-    """Return fixed windows of unseen episodes, one and four control steps long, each with its target."""
+    """Return fixed windows of unseen episodes, one and four control steps long, with their targets."""
     rng = np.random.default_rng(0)
     start, end, episode = (recording.index[name] for name in ("step_t_us", "step_end_us", "step_flight"))
     following = np.searchsorted(episode, episode, side="right")  # the first step of the next episode
@@ -370,7 +374,7 @@ def held_out_windows(
 
 
 def held_out_figures(evae: EventVAE, held_out: HeldOut) -> dict[str, float]:
-    """Return figures of `evae.validate` for each window length; `collapsed` is 1 if it is so at all."""
+    """Return the metrics of `evae.validate` per window length; `collapsed` is 1 if all lengths collapsed."""
     evae.eval()
     found = {name: validate(evae, batch, targets) for name, (batch, targets) in held_out.items()}
     figures = {
@@ -385,7 +389,7 @@ def held_out_figures(evae: EventVAE, held_out: HeldOut) -> dict[str, float]:
 def freeze(
     folder: Run, tracker: Tracker, evae: EventVAE, about: Mapping[str, object], held_out: HeldOut
 ) -> dict[str, float]:
-    """Write the encoder file and a picture of its reconstructions; return its held-out figures."""
+    """Write the encoder file and a picture of its reconstructions; return its held-out metrics."""
     figures = held_out_figures(evae, held_out)
     manifest = {
         **{name: about[name] for name in ("sensor", "sensor_hash", "scenes")},
@@ -409,17 +413,17 @@ def example_pictures(evae: EventVAE, held_out: HeldOut) -> tuple[np.ndarray, np.
 
 
 def encoder_file(folder: Run) -> Path:
-    """Return where the frozen encoder lives in a run folder."""
+    """Return the path of the frozen encoder in a run folder."""
     return folder.encoder / ENCODER
 
 
 def checkpoints(folder: Path) -> list[Path]:
-    """Return the checkpoints of a pretraining, the newest first."""
+    """Return the checkpoints of a pretraining, newest first."""
     return sorted(folder.glob(CHECKPOINTS), reverse=True)
 
 
 def save_checkpoint(folder: Path, training: EvaeTraining, iteration: int) -> None:
-    """Write everything that a killed training needs to go on; the file's name holds its SHA-256."""
+    """Write everything that a killed training needs to resume; the file's name contains its SHA-256."""
     state = {
         "evae": training.evae.state_dict(),
         "optimizer": training.optimizer.state_dict(),
@@ -436,7 +440,7 @@ def save_checkpoint(folder: Path, training: EvaeTraining, iteration: int) -> Non
 
 
 def restore(folder: Path, training: EvaeTraining) -> int:
-    """Load the newest undamaged checkpoint into a training; return how many iterations it has done."""
+    """Load the newest undamaged checkpoint; return the number of iterations done, 0 without a checkpoint."""
     for path in checkpoints(folder):
         content = path.read_bytes()
         if hashlib.sha256(content).hexdigest() != path.stem.rpartition("-")[2]:

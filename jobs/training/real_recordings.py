@@ -1,4 +1,4 @@
-"""Turn real cameras' recordings into data of the event VAE: cropped, on the simulator's pixels, in steps."""
+"""Turn recordings of real cameras into data for the event VAE: cropped, downscaled, in control steps."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,16 +15,16 @@ from jobs.config.schema import RecordingConfig
 from jobs.run.recordings import recording_parts
 
 GAP_US = 1_000_000  # between one recording and the next
-FROM_THE_FILE = RecordingConfig()  # a file that says everything
+FROM_THE_FILE = RecordingConfig()  # for a file that states everything itself
 
 
 class Recorded(NamedTuple):
     """A part of a recording.
 
     Attributes:
-        name: The file's.
-        events: EVENT (N,) of the simulator's sensor size, t in us from the beginning of the part.
-        ends_us: Ends of its control steps, int64 (S,); the first begins at 0.
+        name: Name of the file.
+        events: EVENT (N,) of the simulator's sensor size, t in us from the start of the part.
+        ends_us: Ends of the control steps [us], int64 (S,); the first step starts at 0.
     """
 
     name: str
@@ -35,24 +35,24 @@ class Recorded(NamedTuple):
 def read_recorded(
     path: str | Path, env: EnvConfig, validation_share: float, settings: RecordingConfig = FROM_THE_FILE
 ) -> dict[str, Recorded]:
-    """Return an event file as the simulator's camera would have seen its middle.
+    """Return an event file as the simulator's camera would have recorded the middle of its picture.
 
-    Of the picture the largest part of the camera's proportions stays, around the centre; pixels are
-    made as large as the camera has them (`envs.recordings.downscale`). Contrast threshold, optics and motion
-    stay those of the recording, whatever the simulation's are. Gaps of more than a second are closed.
+    The picture is cropped to the largest centred part with the camera's proportions, and downscaled to the
+    camera's resolution (`envs.recordings.downscale`). Contrast threshold, optics and motion remain the
+    recording's, whatever the simulation has. Gaps of more than a second are closed.
 
     Args:
         path: A file that `envs.recordings.read_events` reads.
         env: The simulation: camera and control rate.
-        validation_share: Of the time, at the end, that is kept for validation, 0 < share < 1.
-        settings: What the file does not say.
+        validation_share: Fraction of the time, at the end, used for validation, 0 < share < 1.
+        settings: Facts that the file does not state.
 
     Returns:
-        "train" and "validation".
+        The parts "train" and "validation".
 
     Raises:
-        ValueError: The file is refused, does not say its size, has fewer pixels than the camera, or
-            is too short for a control step of either part.
+        ValueError: The file cannot be read, does not state its sensor's size, has fewer pixels than the
+            camera, or is too short for a control step in each part.
     """
     fitted = fit(path, env, settings)
     kept = round(fitted.steps * (1.0 - validation_share))
@@ -69,10 +69,10 @@ def read_recorded(
 def read_whole(
     path: str | Path, env: EnvConfig, settings: RecordingConfig = FROM_THE_FILE
 ) -> tuple[Recorded, "Fitted"]:
-    """Return all of a file as `read_recorded`, with what is known of it.
+    """Return a whole file as one part, read as by `read_recorded`, and the `Fitted` recording.
 
     Raises:
-        ValueError: As `read_recorded`, or it is shorter than a control step.
+        ValueError: As in `read_recorded`, or the file is shorter than a control step.
     """
     fitted = fit(path, env, settings)
     if fitted.steps == 0:
@@ -84,14 +84,14 @@ def read_whole(
 
 
 class Fitted(NamedTuple):
-    """A recording on the camera's pixels, and on a clock that begins at 0 and has no gaps.
+    """A recording at the camera's resolution, on a clock that starts at 0 and has no gaps.
 
     Attributes:
         events: EVENT (N,), t in us.
-        steps: Whole control steps.
-        num_events: Events of the file.
-        gaps: Gaps that were closed [-].
-        closed_us: Their length together [us].
+        steps: Number of whole control steps.
+        num_events: Number of events in the file.
+        gaps: Number of gaps that were closed [-].
+        closed_us: Total length of these gaps [us].
     """
 
     events: np.ndarray
@@ -102,7 +102,7 @@ class Fitted(NamedTuple):
 
 
 def fit(path: str | Path, env: EnvConfig, settings: RecordingConfig) -> Fitted:
-    """Read a file part by part, and keep what the camera would have seen; raises as `read_recorded`."""
+    """Read a file part by part, crop and downscale it, and close its gaps; raises like `read_recorded`."""
     small, downscale, shape = [np.empty(0, EVENT)], None, (0, 0)
     begin_us, last_us, count, gaps, closed_us = None, 0, 0, 0, 0
     step_us = round(1e6 / env.control_hz)
@@ -132,10 +132,10 @@ def fit(path: str | Path, env: EnvConfig, settings: RecordingConfig) -> Fitted:
 def cropped(
     events: np.ndarray, shape: tuple[int, int], camera: CameraConfig
 ) -> tuple[np.ndarray, tuple[int, int]]:
-    """Return the events of the largest part in the middle with a camera's proportions, and its shape (H, W).
+    """Crop to the largest centred part with a camera's proportions; return events and its shape (H, W).
 
     Raises:
-        ValueError: It has fewer pixels than the camera.
+        ValueError: The recording has fewer pixels than the camera.
     """
     scale = min(shape[0] / camera.height, shape[1] / camera.width)
     if scale < 1.0:
@@ -151,7 +151,7 @@ def cropped(
 
 
 def _part(name: str, events: np.ndarray, span: tuple[int, int], env: EnvConfig) -> Recorded:
-    """Return some control steps of a recording, on a clock of their own."""
+    """Return the control steps `span` of a recording, with times from the start of the first one."""
     ends_us = np.array([clock_us(step, env.control_hz) for step in range(span[0], span[1] + 1)], np.int64)
     first, last = np.searchsorted(events["t"], ends_us[[0, -1]], side="right")
     part = events[first:last].copy()
@@ -160,7 +160,7 @@ def _part(name: str, events: np.ndarray, span: tuple[int, int], env: EnvConfig) 
 
 
 def with_recorded(recording: Recording, parts: Sequence[tuple[Recorded, int]]) -> Recording:
-    """Return a recording of episodes with parts of others behind it, each of at most some control steps."""
+    """Append parts of recordings to recorded episodes, each up to its largest number of control steps."""
     clock = int(recording.index["step_end_us"][-1]) + GAP_US if len(recording.index["step_end_us"]) else 0
     episode = int(recording.about["flights"])
     events, index, names = [recording.events], [np.stack(list(recording.index.values()))], []
@@ -181,7 +181,7 @@ def with_recorded(recording: Recording, parts: Sequence[tuple[Recorded, int]]) -
 
 
 def no_episodes(env: EnvConfig) -> Recording:
-    """Return the recording of nothing, for real recordings alone."""
+    """Return an empty recording, to which real recordings are appended."""
     settings = sensor_settings(env)
     none = np.empty(0, np.int64)
     about = {"sensor": settings, "sensor_hash": settings_hash(settings), "scenes": [], "flights": 0}

@@ -2,10 +2,9 @@
 
 Run: python -m platform.launch +exp=train
 Expect: the policy folder, its checkpoints under `train/`, and a learning curve in
-`train/results.jsonl`. A stopped run continues from its last whole checkpoint when the same
-command is given again; an environment step that was reported once is not reported twice. What
-a lost process or machine ends is tried again at once, what the code raises is not: it would
-raise the same again.
+`train/results.jsonl`. If a run stops, the same command resumes it from its last complete
+checkpoint; no environment step is reported twice. After the loss of a process or a machine the
+training is retried at once, after an error of the code it is not: the error would repeat.
 """
 
 import contextlib
@@ -46,7 +45,7 @@ from models.policy.rllib_module import PolicyModule
 
 OnResult = Callable[[int, Mapping[str, float]], None]
 
-# Name in the tracker -> where RLlib's result has it.
+# Name in the tracker -> path in RLlib's result.
 METRICS = {
     "train/episode_return": ("env_runners", "episode_return"),
     "train/episodes": ("env_runners", "num_episodes_lifetime"),
@@ -64,27 +63,27 @@ SAMPLED = ("env_runners", "num_env_steps_sampled")
 LEARNER = ("learners", "default_policy")
 MODULE = Path("learner_group", "learner", "rl_module", "default_policy")
 MAX_FAILURES = 2
-CHECKPOINTS_KEPT = 3  # one more than the experiment may name when it is killed
+CHECKPOINTS_KEPT = 3  # one more than Tune's state may name after a kill
 RAISED = re.compile(r"^(?:\w+\.)*\w+(?:Error|Exception|Exit|Interrupt)\b.*$", re.MULTILINE)
 
-_listeners: list[Callable[[Mapping[str, Any]], None]] = []  # the last one hears the results
+_listeners: list[Callable[[Mapping[str, Any]], None]] = []  # the last one receives the results
 
 
 class TrainingError(RuntimeError):
-    """Training stopped; the message says why in one line and how to go on."""
+    """Training stopped; the message says in one line why, and how to resume."""
 
 
 class Relay(tune.Callback):
-    """Hands results to the listener of this process, see `relayed_to`.
+    """Passes results to the listener of this process, see `relayed_to`.
 
-    Tune pickles its callbacks into the experiment's state, and neither a tracker nor a
-    progress bar can be pickled: the callback carries nothing.
+    Tune pickles its callbacks into the experiment's state. Neither a tracker nor a progress
+    bar can be pickled, so the callback has no attributes.
     """
 
     def on_trial_result(
         self, iteration: int, trials: list[Any], trial: Any, result: dict[str, Any], **info: Any
     ) -> None:
-        """Pass one result on, with the number of restarts before it, and show its notice."""
+        """Pass on a result with the number of restarts so far, and print its notice."""
         if NOTICE in result:
             console.print(result[NOTICE])
         _listeners[-1]({**result, "trial_restarts": trial.num_failures})
@@ -92,13 +91,13 @@ class Relay(tune.Callback):
     def on_checkpoint(
         self, iteration: int, trials: list[Any], trial: Any, checkpoint: tune.Checkpoint, **info: Any
     ) -> None:
-        """Seal one, and keep what Tune knows of the training."""
+        """Seal a checkpoint, and copy Tune's state of the training."""
         if on_disk(checkpoint):
             seal(Path(checkpoint.path))
             keep_state(Path(checkpoint.path).parents[1])
 
     def on_trial_recover(self, iteration: int, trials: list[Any], trial: Any, **info: Any) -> None:
-        """Report that the training continues, or stop it if its code raised."""
+        """Report that the training resumes, or stop it if its code raised an error."""
         error = newest_error(trial.error_file)
         raised = RAISED.findall(error)
         if raised and not raised[-1].startswith("ray.exceptions."):
@@ -108,7 +107,7 @@ class Relay(tune.Callback):
 
 
 def run(config: Config) -> dict[str, float]:
-    """Collect and pretrain where the policy needs that and it is not done; train; return the figures."""
+    """Collect and pretrain if the policy needs it and it is not done; then train; return the metrics."""
     check_inputs(config)
     folder = open_run(config)
     with open_tracker(folder.config, folder) as tracker:
@@ -117,9 +116,9 @@ def run(config: Config) -> dict[str, float]:
 
 
 def train(folder: Run, encoder_path: Path | None, on_result: OnResult) -> Path:
-    """Train as `train_one` does; of several `train.candidates` the best becomes the run's policy.
+    """Train like `train_one`; with several `train.candidates`, the best one becomes the run's policy.
 
-    Candidates share the run's encoder. Each has a folder in the run folder, where a stopped one continues.
+    Candidates share the run's encoder. Each has a folder in the run folder, from which it resumes if stopped.
     """
     if finished(folder, "train") is not None:
         return folder.policy
@@ -154,7 +153,7 @@ def train_one(folder: Run, encoder_path: Path | None, on_result: OnResult) -> Pa
         The policy folder, complete in itself.
 
     Raises:
-        TrainingError: If training failed or a loss is not finite.
+        TrainingError: Training failed, or a loss is not finite.
     """
     if finished(folder, "train") is not None:
         return folder.policy
@@ -193,10 +192,10 @@ def last_line(error: Exception | str) -> str:
 def export_policy(
     config: Config, checkpoint: Path, encoder_path: Path | None, target: Path, figures: dict[str, float]
 ) -> None:
-    """Write the policy folder of a checkpoint of this run.
+    """Write the policy in a checkpoint of this run as a policy folder.
 
     Raises:
-        TrainingError: If the checkpoint's encoder is not the one in the file.
+        TrainingError: The checkpoint's encoder is not the one in the file.
     """
     spec, module = policy_spec(config), cast(Any, RLModule.from_checkpoint(checkpoint / MODULE))
     evae, of_encoder = None, EncoderManifest()
@@ -213,7 +212,7 @@ def export_policy(
 
 
 def _tuner(folder: Run, built: Any) -> tune.Tuner:
-    """Return the experiment in the run folder: the one that is there, else a new one."""
+    """Return Tune's experiment of the run folder: the existing one, else a new one."""
     config = folder.config
     path, trainable = storage(config.cluster, folder.train), algorithm_of(config).trainable(config)
     if can_continue(path, folder.train):
@@ -232,7 +231,7 @@ def _tuner(folder: Run, built: Any) -> tune.Tuner:
 
 
 def can_continue(path: str, folder: Path) -> bool:
-    """Whether Tune can continue an experiment; its state is mended first, and what was done is printed.
+    """Repair Tune's state of an experiment if needed, and print that; return whether Tune can resume it.
 
     Args:
         path: Where the experiment is stored: a path or an address.
@@ -241,18 +240,18 @@ def can_continue(path: str, folder: Path) -> bool:
     said = mend_state(folder)
     if said:
         console.print(said)
-    # Killed before its first checkpoint of the experiment, Tune leaves a folder it cannot restore.
+    # If Tune is killed before its first checkpoint of the experiment, it leaves a folder it cannot restore.
     return bool(tune.Tuner.can_restore(path)) and holds(path, "experiment_state-")
 
 
 def run_config(path: str, checkpoint_every: int, at_end: bool | None = None, **more: Any) -> tune.RunConfig:
-    """Return how Tune runs an experiment: stored at `path`, its results relayed, the newest checkpoints kept.
+    """Return Tune's run configuration: stored at `path`, with a `Relay`, keeping the newest checkpoints.
 
     Args:
         path: As `jobs.run.ray_cluster.storage` returns it.
         checkpoint_every: Iterations from one checkpoint to the next.
-        at_end: Whether there is one at the end too; None: as Tune does.
-        **more: Of `tune.RunConfig`.
+        at_end: Whether to write a checkpoint at the end too; None: Tune's default.
+        **more: Other arguments of `tune.RunConfig`.
     """
     place, _, name = path.rpartition("/")
     return tune.RunConfig(
@@ -269,18 +268,18 @@ def run_config(path: str, checkpoint_every: int, at_end: bool | None = None, **m
 
 
 def on_disk(checkpoint: tune.Checkpoint) -> bool:
-    """Whether a checkpoint lies in a folder; an object store checks what it keeps itself."""
+    """Whether a checkpoint lies in a local folder; an object store checks its own files."""
     return isinstance(checkpoint.filesystem, pyarrow.fs.LocalFileSystem)
 
 
 def restored(path: str, trainable: type, built: Any) -> tune.Tuner:
-    """Return the experiment of a folder, ready to continue."""
+    """Return the experiment stored at `path`, ready to resume."""
     return tune.Tuner.restore(path, trainable, resume_errored=True, param_space=built)
 
 
 @contextlib.contextmanager
 def _listening(folder: Run, on_result: OnResult) -> Iterator[dict[str, float]]:
-    """Record, show and pass on each new result; yields the newest metrics, kept up to date."""
+    """Record, show and pass on each new result; yield the newest metrics, a dict updated in place."""
     config, file = folder.config, folder.train / "results.jsonl"
     reported, last = reported_so_far(file)
     algorithm, total, since_s = algorithm_of(config), config.train.env_steps, time.monotonic()
@@ -305,7 +304,7 @@ def _listening(folder: Run, on_result: OnResult) -> Iterator[dict[str, float]]:
 
 @contextlib.contextmanager
 def relayed_to(listen: Callable[[Mapping[str, Any]], None]) -> Iterator[None]:
-    """Let a function hear each result that a `Relay` gets."""
+    """Pass each result that a `Relay` receives to `listen`, until the block ends."""
     _listeners.append(listen)
     try:
         yield
@@ -314,7 +313,7 @@ def relayed_to(listen: Callable[[Mapping[str, Any]], None]) -> Iterator[None]:
 
 
 def reported_so_far(file: Path) -> tuple[int, dict[str, float]]:
-    """Return environment steps and metrics of the last whole line of a results file; 0 and none without one.
+    """Return environment steps and metrics of a results file's last complete line; 0 and {} without a line.
 
     Raises:
         RunError: A line is damaged.
@@ -327,15 +326,15 @@ def reported_so_far(file: Path) -> tuple[int, dict[str, float]]:
 
 
 def read_metrics(result: Mapping[str, object], seconds: float, algorithm: Algorithm) -> dict[str, float]:
-    """Return the metrics worth recording of an RLlib result; NaN where nothing was measured.
+    """Return the metrics to record from an RLlib result; NaN for what was not measured.
 
     Args:
-        result: One iteration's.
-        seconds: Time since the result before, on a clock that does not jump as RLlib's may.
-        algorithm: Its losses and figures are recorded.
+        result: Result of one iteration.
+        seconds: Time since the previous result [s], on a monotonic clock; RLlib's may jump.
+        algorithm: Algorithm whose losses and figures are recorded.
 
     Raises:
-        TrainingError: If a loss is NaN or infinite; RLlib would train on and not tell.
+        TrainingError: A loss is NaN or infinite; RLlib would continue without a message.
     """
     learnt = {name: (*LEARNER, key) for name, key in {**algorithm.losses, **algorithm.figures}.items()}
     metrics = {name: _lookup(result, path) for name, path in {**METRICS, **learnt}.items()}
@@ -358,7 +357,7 @@ def _lookup(result: Mapping[str, object], path: tuple[str, ...]) -> float:
 
 
 def _note(metrics: Mapping[str, float]) -> str:
-    """Return the figures that a person watches."""
+    """Return the note at the progress bar: speed, mean return and success rate."""
     parts = [f"{metrics['perf/env_steps_per_second']:,.0f} steps/s"]
     if not math.isnan(metrics["train/episode_return"]):
         parts.append(f"return {metrics['train/episode_return']:.1f}")

@@ -1,4 +1,4 @@
-"""RLlib's algorithms as Tune runs them here: whole checkpoints, and errors that reach the user."""
+"""Wrappers of RLlib's algorithms for Tune: complete checkpoints, and errors that reach the user."""
 
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from jobs.run.checkpoints import drop_unfinished, unfinished
 
 
 class Trainable(tune.Trainable):
-    """Tune's Trainable, which writes a checkpoint next to the finished ones; a failed save leaves nothing."""
+    """A Trainable that writes a checkpoint next to the finished ones; a failed save leaves nothing behind."""
 
     _storage: Any = None  # Tune's; None without Tune
 
@@ -20,7 +20,7 @@ class Trainable(tune.Trainable):
         return Path(self._storage.trial_fs_path) if local else None
 
     def save(self, checkpoint_dir: str | None = None) -> Any:
-        """Write a checkpoint; Tune copies what it finds in the folder to its place."""
+        """Write a checkpoint into a folder, from which Tune copies it to its place."""
         if checkpoint_dir or not self._storage:
             return super().save(checkpoint_dir)
         with unfinished(self.checkpoints()) as folder:
@@ -28,17 +28,17 @@ class Trainable(tune.Trainable):
 
 
 class Guarded(Trainable):
-    """Mixed into an algorithm of RLlib's: an error of its construction is raised by the first iteration.
+    """Mix-in of an RLlib algorithm: the first iteration raises an error of its construction.
 
-    Ray ends an actor whose construction failed once everything it owns is released, and env runners
-    never are: the launcher would wait forever.
+    Ray ends an actor whose construction failed only once everything it owns is released. Env runners
+    are never released, so the launcher would wait forever.
     """
 
     _refused: Exception | None = None
     _built = False
 
     def setup(self, config: Any) -> None:
-        """Build the algorithm."""
+        """Build the algorithm; store an error for the first iteration."""
         try:
             drop_unfinished(self.checkpoints())
             super().setup(config)
@@ -62,7 +62,7 @@ class Guarded(Trainable):
             super().load_checkpoint(checkpoint)
 
     def get_auto_filled_metrics(self, *told: Any, **named: Any) -> dict[str, object]:
-        """Return Tune's metrics without the configuration, whose copy took a tenth of an iteration."""
+        """Return Tune's metrics without the configuration: to copy it takes a tenth of an iteration."""
         return {**tune.Trainable.get_auto_filled_metrics(self, *told, **named), "config": {}}
 
     def step(self) -> Any:
@@ -76,11 +76,11 @@ class Guarded(Trainable):
         return super().step()
 
     def cleanup(self) -> None:
-        """Release what was built."""
+        """Release the algorithm, if it was built."""
         if self._built:
             super().cleanup()
 
 
 def guarded(algorithm: type) -> type:
-    """Return an algorithm of RLlib's under its own name, by which Tune finds a training again."""
+    """Return an RLlib algorithm with `Guarded`, under its own name, by which Tune resumes a training."""
     return type(algorithm.__name__, (Guarded, algorithm), {})

@@ -1,1 +1,1 @@
-"""From events to a latent: batches, the event VAE, its lookup table, and encoder files."""
+"""Encode events into latents: event batches, the event VAE, its lookup table, and encoder files."""

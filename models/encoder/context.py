@@ -6,26 +6,26 @@ ECN is three per-event layers (64, 128, context), each with batch normalisation 
 ReLU floors the context at 0, which is therefore the identity of the maximum.
 
 With `octaves` the first layer also reads sin and cos of pi/2 2^k x and y, k = 0, 1, ..., for x and y in
-[-1, 1]: a network of coordinates alone learns only smooth functions of them (Tancik et al. 2020). The table
-of the frozen encoder has as many rows, and costs the same.
+[-1, 1], because a network of raw coordinates learns only smooth functions of them (Tancik et al. 2020). Size
+and cost of the frozen encoder's table do not change.
 
-With `pool_rank` r > 1 a context holds the r-th largest value of each feature instead, 0 of fewer than r
-events: r - 1 false events alone cannot raise it. An event that occurs twice then counts twice.
+With `pool_rank` r > 1 a context holds the r-th largest value of each feature instead, or 0 if there are fewer
+than r events: r - 1 false events alone cannot raise it. An event that occurs twice then counts twice.
 
 With EventNet's coding (appendix A.2, equation 4) an event has a complex number per feature,
 
     a = [ tanh(ECN(x, y, p)) - age ]_+ exp(-i 2 pi age),   age = 1 - t
 
-and the context is the one of largest magnitude: its real parts, then its imaginary parts. The
-magnitude is the additive form with tanh features and the code -age; the phase is that of the
-event that wins (the newest of equals) and has no gradient.
+and the context holds, per feature, the number of largest magnitude: all real parts, then all imaginary
+parts. The magnitude is the additive form with tanh features and the code -age. The phase comes from
+the winning event (the newest one in a tie) and has no gradient.
 
 `EventContextNetwork.plain` is this formula, event by event. `EventContextNetwork.forward` is
 the same function with the same parameters, gradients and running statistics, tens of times
 faster on a CPU (`benchmarks/context.py`): x, y, p have only 2 H W values, so the layers run once
 per distinct value, with batch statistics weighted by how often each occurs. Only the order of the
 sums differs; `tests/models/encoder/test_context.py` states the bounds for float64 and float32. On a GPU
-the last layer and the maximum are torch's (`max_on_device`).
+torch computes the last layer and the maximum (`max_on_device`).
 """
 
 import itertools
@@ -55,11 +55,11 @@ class EventContextNetwork(nn.Module):
         context: Features D, even.
         norm: "batch" or "none". With "batch" the layers have no bias: the normalisation
             subtracts it again, and its gradient would be rounding noise that Adam amplifies.
-        coding: Of time, one of `models.encoder.embedding.CODINGS`; "bytestream_xy" has none.
-        pool_rank: Which value over the events is the context: 1, the largest, or the second, third, ...
-        octaves: Of sines and cosines of x and y that the first layer reads as well.
+        coding: Time coding, one of `models.encoder.embedding.CODINGS`; "bytestream_xy" has none.
+        pool_rank: Rank of the value over the events that is the context: 1 for the largest, 2, 3, ...
+        octaves: Number of octaves of sines and cosines of x and y that the first layer also reads.
 
-    A frozen network (parameters that need no gradient) never moves its running statistics,
+    A frozen network (parameters that need no gradient) never updates its running statistics,
     not even in train mode.
     """
 
@@ -84,11 +84,11 @@ class EventContextNetwork(nn.Module):
         self.norms = nn.ModuleList(nn.BatchNorm1d(size) for size in sizes[1:] if norm == "batch")
 
     def forward(self, batch: EventBatch) -> Tensor:
-        """Return context (B, D) of a batch of windows, or (B, 2 D) by EventNet's coding.
+        """Return the contexts (B, D) of a batch of windows; (B, 2 D) with EventNet's coding.
 
         Raises:
-            ValueError: The batch was made for another grid, or has fewer than two events
-                to take batch statistics from, or the weights are not float32 or float64.
+            ValueError: The batch is on another grid, has fewer than two events for batch statistics,
+                or the weights are neither float32 nor float64.
         """
         cell, bins, embedding = self._address(batch)
         present, multiplicity, rank = distinct(cell)
@@ -101,10 +101,10 @@ class EventContextNetwork(nn.Module):
         return self._rotated(context, winning_bin) if squash else context
 
     def plain(self, batch: EventBatch) -> Tensor:
-        """Return the same context, event by event: what the fused form is tested against.
+        """Compute the same contexts event by event; the reference in the tests of `forward`.
 
         Raises:
-            ValueError: As `forward`.
+            ValueError: As in `forward`.
         """
         cell, bins, embedding = self._address(batch)
         h = self._inputs(cell)
@@ -130,7 +130,7 @@ class EventContextNetwork(nn.Module):
         return self._rotated(best, winning_bin)
 
     def cell_features(self) -> Tensor:
-        """Return features (cells, D) >= 0 of every distinct event, by the running statistics."""
+        """Return the features (cells, D) >= 0 of every distinct event, using the running statistics."""
         cells = np.arange((2 if self.uses_polarity else 1) * self.grid.width * self.grid.height)
         h, weight, bias = self._last_layer(self._inputs(cells), None, 0)
         features = torch.relu(affine(h, weight, bias))
@@ -138,14 +138,14 @@ class EventContextNetwork(nn.Module):
 
     @property
     def learns(self) -> bool:
-        """Whether batch statistics are taken and running ones moved."""
+        """Whether to use batch statistics and update the running ones."""
         return self.training and self.layers[0].weight.requires_grad
 
     def _pairs(self) -> list[tuple[Any, Any]]:
         return list(zip(self.layers, self.norms if len(self.norms) else [None] * 3, strict=True))
 
     def _address(self, batch: EventBatch) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return cell and row of code of every event, and the codes (one row of zeros without time)."""
+        """Return each event's cell and row in the codes, and the codes (one row of zeros without time)."""
         if batch.grid != self.grid:
             raise ValueError(
                 f"the batch has {batch.grid}, the model {self.grid}: make it with the model's grid"
@@ -159,13 +159,13 @@ class EventContextNetwork(nn.Module):
         return cell, np.zeros_like(batch.bin) if self.coding == "none" else batch.bin, codes
 
     def _rotated(self, magnitude: Tensor, winning_bin: Tensor) -> Tensor:
-        """Return real and imaginary parts (B, 2 D) of magnitudes (B, D) with the phase of bins (B, D)."""
+        """Return real and imaginary parts (B, 2 D) from magnitudes (B, D) and their time bins (B, D)."""
         dtype = str(magnitude.dtype).removeprefix("torch.")
         phase = torch.from_numpy(np.array(eventnet_phase(self.grid.time_bins, dtype))).to(magnitude.device)
         return torch.cat([magnitude * part[winning_bin.long()] for part in phase], dim=1)
 
     def _inputs(self, cell: np.ndarray) -> Tensor:
-        """Return inputs of cells (N, inputs): x, y scaled to [-1, 1], p if it is read, and the octaves."""
+        """Return the first layer's inputs (N, inputs): x, y scaled to [-1, 1], p if used, and the octaves."""
         width, height = self.grid.width, self.grid.height
         columns = [
             2.0 * (cell % width) / max(width - 1, 1) - (width > 1),
@@ -177,7 +177,7 @@ class EventContextNetwork(nn.Module):
         return torch.from_numpy(np.stack(columns, axis=1)).to(self.layers[0].weight)
 
     def _share(self, multiplicity: np.ndarray, events: int) -> Tensor | None:
-        """Return fraction of the batch's events in each present cell; None without batch statistics."""
+        """Return the fraction of the batch's events in each present cell; None without batch statistics."""
         if not (self.learns and len(self.norms)):
             return None
         if events < 2:
@@ -185,7 +185,7 @@ class EventContextNetwork(nn.Module):
         return torch.from_numpy(multiplicity / events).to(self.layers[0].weight)
 
     def _last_layer(self, h: Tensor, share: Tensor | None, events: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Run the first two layers; the last as (h, weight, bias), to be finished where it is needed."""
+        """Run the first two layers; return the last as (h, weight, bias), for the caller to apply."""
         *inner, last = self._pairs()
         for layer, norm in inner:
             h, weight, bias = folded(layer, norm, h, share, events)
@@ -198,16 +198,16 @@ def folded(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return one affine map (h, weight, bias) equal to `norm(layer(h))` over the batch of events.
 
-    The batch mean and variance of W h follow from those of h: W mean(h) and diag(W cov(h) W^T).
-    So the normalisation costs a small covariance instead of passes over all features, and
-    leaves the gradient of the output sparse. The root is `rsqrt`'s: that of `sqrt` is MKL's, and not the same
-    on every processor.
+    The batch mean and variance of W h follow from mean and covariance of h: W mean(h), diag(W cov(h) W^T).
+    So the normalisation costs a small covariance instead of passes over all features, and the gradient of
+    the output stays sparse. `rsqrt` is used because torch's `sqrt` calls MKL, whose result depends on the
+    processor.
 
     Args:
-        layer: Without bias if `norm` is given.
+        layer: The layer, without bias if `norm` is given.
         norm: Batch normalisation, or None.
         h: Inputs (U, K) of the distinct events.
-        share: Their fraction of the batch (U,); None: running statistics.
+        share: Fraction of the batch's events that equal each (U,); None: use running statistics.
         events: Events of the batch, for the unbiased running variance.
 
     Returns:
@@ -230,7 +230,7 @@ def folded(
 
 
 class Events(NamedTuple):
-    """Cell and time bin of each event, `offsets` as of `EventBatch`, and the code of each time bin."""
+    """Cell and time bin of each event, `offsets` as in `EventBatch`, and the code of each time bin."""
 
     cell: np.ndarray
     bin: np.ndarray
@@ -239,21 +239,21 @@ class Events(NamedTuple):
 
 
 def newest_first(events: Events) -> Events:
-    """Return each window's events by falling bin: of equals the newest wins."""
+    """Sort each window's events by descending time bin, so that the newest wins a tie."""
     window = np.repeat(np.arange(len(events.offsets) - 1), np.diff(events.offsets))
     order = np.lexsort((-events.bin, window))
     return events._replace(cell=events.cell[order], bin=events.bin[order])
 
 
 def _largest(values: Tensor, rank: int) -> Tensor:
-    """Return the rank-th largest (D,) of values (N, D) >= 0 of events; 0 of fewer events than that."""
+    """Return the rank-th largest value (D,) of each column of values (N, D) >= 0; 0 if N < rank."""
     return values.topk(rank, 0).values[-1] if len(values) >= rank else values[:0].sum(0)
 
 
 def max_on_device(
     h: Tensor, weight: Tensor, bias: Tensor, events: Events, squash: bool, rank: int
 ) -> tuple[Tensor, Tensor]:
-    """Return what `MaxContext` computes, by operations of torch on the device of its inputs."""
+    """Compute `MaxContext` with torch operations, on the device of the inputs."""
     features = torch.relu(affine(h, weight, bias))
     features = torch.tanh(features) if squash else features
     return max_context(features, events.codes, (events.cell, events.bin), events.offsets, rank)
@@ -269,7 +269,7 @@ class MaxContext(torch.autograd.Function):
     def forward(
         ctx: Any, h: Tensor, weight: Tensor, bias: Tensor, events: Events, squash: bool, rank: int
     ) -> tuple[Tensor, Tensor]:
-        """Return context (B, D) and the bin (B, D) of the event it is from, 0 without one."""
+        """Return the contexts (B, D) and the time bin (B, D) of the event behind each value, 0 if none."""
         activation = affine(h, weight, bias).relu_()
         features = (activation.tanh_() if squash else activation).numpy()
         context = np.zeros((len(events.offsets) - 1, len(bias)), features.dtype)
@@ -288,7 +288,7 @@ class MaxContext(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
-        """Return gradients of h, weight and bias: only winning events with an active feature have one."""
+        """Return gradients of h, weight and bias; only winning events with an active feature contribute."""
         h, weight, winner = ctx.saved_tensors
         if ctx.slope is not None:
             gradient = gradient * torch.from_numpy(ctx.slope)
@@ -299,7 +299,7 @@ class MaxContext(torch.autograd.Function):
 
 
 def _tanh_slope(features: np.ndarray, winner: np.ndarray) -> np.ndarray:
-    """Return the slope of tanh (B, D) at the winners' features (cells, D); anything without a winner."""
+    """Return the slope of tanh (B, D) at the winners' features (cells, D); arbitrary without a winner."""
     if len(features) == 0:
         return np.ones(winner.shape, features.dtype)
     return 1.0 - features[np.maximum(winner, 0), np.arange(winner.shape[1])] ** 2
@@ -307,10 +307,10 @@ def _tanh_slope(features: np.ndarray, winner: np.ndarray) -> np.ndarray:
 
 @numba.njit(cache=True, error_model="numpy")
 def _maximum(features, events, context, winner) -> None:  # type: ignore[no-untyped-def]
-    """Raise `context` (B, D) to the events' maximum; `winner` becomes its event, the first of equals.
+    """Raise `context` (B, D) to the events' maximum; store the winning event in `winner`, the first in a tie.
 
-    Four events at a time, so that context and winner are read and written a quarter as often; the last
-    four may hold the last event several times, which changes nothing.
+    Processes four events at a time, so that context and winner are read and written a quarter as often. The
+    last four may repeat the last event, which changes nothing.
     """
     cell, bins, offsets, codes = events.cell, events.bin, events.offsets, events.codes
     for b in range(context.shape[0]):
@@ -340,9 +340,9 @@ def _maximum(features, events, context, winner) -> None:  # type: ignore[no-unty
 
 @numba.njit(cache=True, error_model="numpy")
 def _ranked(features, events, rank, context, winner) -> None:  # type: ignore[no-untyped-def]
-    """Compute `_maximum` with the rank-th largest value of the events and 0, of equals the later.
+    """Like `_maximum`, but find the rank-th largest value, at least 0; equal values rank in event order.
 
-    Each event is sorted into the `rank` largest so far; a value that one level gives up goes to the next.
+    Each event is inserted into the `rank` largest values so far; a displaced value moves to the next level.
     """
     size = context.shape[1]
     given, of_event, moved = np.empty(size, context.dtype), np.empty(size, np.int32), np.empty(size, np.bool_)
@@ -367,7 +367,7 @@ def _ranked(features, events, rank, context, winner) -> None:  # type: ignore[no
 
 @numba.njit(cache=True, error_model="numpy")
 def _attribute(features, events, winner, winning_bin) -> None:  # type: ignore[no-untyped-def]
-    """Replace each winning event by its cell, -1 where it has no gradient, and write its bin."""
+    """Replace each winning event by its cell (-1 if it has no gradient) and store its time bin."""
     for b in range(winner.shape[0]):
         for j in range(winner.shape[1]):
             event = winner[b, j]

@@ -2,13 +2,13 @@
 
 Time is normalised by the fixed window, t = (t_us - start_us) / window_us in (0, 1], newest
 near 1 (appendix A.3), and then quantised to the centre of one of `time_bins` bins. The grid
-is part of the model: a table with one row per bin is therefore the model exactly.
+is part of the model, so a table with one row per bin reproduces the model exactly.
 
-A code is what is added to the features of an event before the maximum over events:
+A code is added to the features of an event before the maximum over events:
 
 - "additive": sines and cosines of t (paper equation 1).
-- "eventnet": minus the age 1 - t, the decay of EventNet; its rotation by the age of the event
-  that wins follows after the maximum (`eventnet_phase`).
+- "eventnet": minus the age 1 - t, EventNet's decay. EventNet's rotation by the age of the winning
+  event follows after the maximum (`eventnet_phase`).
 - "none": nothing.
 """
 
@@ -50,10 +50,10 @@ def temporal_embedding(t: npt.ArrayLike, context: int) -> np.ndarray:
 
 
 def time_code(t: npt.ArrayLike, context: int, coding: str = "additive") -> np.ndarray:
-    """Return what a coding adds to the features of events at normalised times: float64 (..., context).
+    """Return the codes that are added to the features of events at normalised times: float64 (..., context).
 
     Raises:
-        ValueError: As `temporal_embedding`, or the coding is unknown.
+        ValueError: As in `temporal_embedding`, or the coding is unknown.
 
     Source: paper equation 1 and equation 4 (appendix A.2).
     """
@@ -67,7 +67,7 @@ def time_code(t: npt.ArrayLike, context: int, coding: str = "additive") -> np.nd
 
 
 def bin_centres(time_bins: int) -> np.ndarray:
-    """Return normalised times (time_bins,) of the bins; left edges would triple the latent's error."""
+    """Return the normalised centre of each bin (time_bins,); left edges would triple the latent's error."""
     return (np.arange(time_bins) + 0.5) / time_bins
 
 
@@ -75,9 +75,9 @@ def bin_centres(time_bins: int) -> np.ndarray:
 def embedding_table(
     time_bins: int, context: int, dtype: str = "float32", coding: str = "additive"
 ) -> np.ndarray:
-    """Read-only `dtype` (time_bins, context): the code of each bin's centre; one row of zeros for "none".
+    """Return the code of each bin's centre, read-only `dtype` (time_bins, context); one zero row for "none".
 
-    It is computed in float64 and rounded once.
+    Computed in float64 and rounded once.
     """
     centres = bin_centres(1 if coding == "none" else time_bins)
     table = np.array(time_code(centres, context, coding), dtype)
@@ -87,7 +87,7 @@ def embedding_table(
 
 @functools.lru_cache(maxsize=4)
 def eventnet_phase(time_bins: int, dtype: str = "float32") -> np.ndarray:
-    """Read-only `dtype` (2, time_bins): real and imaginary part of exp(-i 2 pi age) of each bin.
+    """Return real and imaginary part of exp(-i 2 pi age) of each bin, read-only `dtype` (2, time_bins).
 
     Source: paper equation 4 (appendix A.2), from EventNet (Sekikawa et al. 2019).
     """
@@ -99,10 +99,10 @@ def eventnet_phase(time_bins: int, dtype: str = "float32") -> np.ndarray:
 
 @numba.njit(cache=True, error_model="numpy")
 def time_bin(t_us: int, start_us: int, window_us: int, time_bins: int) -> int:
-    """Return bin of an event: clip(floor(time_bins (t_us - start_us) / window_us), 0, time_bins - 1).
+    """Return the bin of an event: clip(floor(time_bins (t_us - start_us) / window_us), 0, time_bins - 1).
 
-    Exact, in integers: a float32 clock would lose microseconds after 17 s. An event outside
-    its window takes the nearest bin. Assumes window_us in [1, 2^46] and time_bins <= 65536,
+    Exact integer arithmetic; a float32 clock would lose microseconds after 17 s. An event outside
+    its window gets the nearest bin. Assumes window_us in [1, 2^46] and time_bins <= 65536,
     so that nothing overflows.
     """
     offset_us = min(max(t_us, start_us), start_us + window_us) - start_us

@@ -1,7 +1,7 @@
 """The event variational autoencoder (appendix A.1, B.2): events -> context -> latent -> event picture.
 
-With the target "proximity" it decodes instead how near the obstacles ahead are, which a simulator knows and
-events alone do not say.
+With the target "proximity" it decodes the nearness of the obstacles ahead instead, which a simulator knows
+but events alone do not determine.
 
 Loss of one batch, both terms on a stated scale:
 
@@ -11,7 +11,7 @@ Loss of one batch, both terms on a stated scale:
 The mean over pixels is 1 / (H W) of the sum in an evidence lower bound, so `beta` here weighs
 H W times more than the same number in front of a summed error: the appendix's schedule
 (`appendix_beta`) on this scale drives the latent of the full variant to the prior within 1,500
-iterations. A weight near 1e-5 keeps it alive.
+iterations. A weight near 1e-5 avoids this collapse.
 """
 
 import dataclasses
@@ -29,13 +29,13 @@ from models.encoder.event_images import PictureContextNetwork, cell_counts, last
 from models.encoder.products import Linear
 from models.kinds import EvaeSettings, checked
 
-CELLS = 8  # each way, of the target "counts"
-SECTORS = 24  # of the field of view, from left to right, of the target "proximity"
-NEAR = {"proximity": 0.22}  # above it something is there, at 15 m; of other targets above 0
-COUNTED_BITS = 12.0  # log2(1 + count) of a cell is divided by it: 1 at 4,095 events
-LOGVAR_LIMIT = 10.0  # above it exp is continued linearly: exp(89) overflows float32
+CELLS = 8  # cells per side of the target "counts"
+SECTORS = 24  # sectors of the field of view, from left to right, of the target "proximity"
+NEAR = {"proximity": 0.22}  # an obstacle is there above this value, which is 15 m; other targets: above 0
+COUNTED_BITS = 12.0  # divides log2(1 + count) of a cell: 1 at 4,095 events
+LOGVAR_LIMIT = 10.0  # exp is continued linearly above it: exp(89) overflows float32
 ACTIVE_VARIANCE = 0.01  # a latent unit is active if its mean varies more over windows (Burda et al. 2016)
-# A latent that the KL term had emptied held 0.03 nats and explained 0.000; living ones hold 10 and more.
+# Measured: a collapsed latent held 0.03 nats and explained 0.000; working latents hold 10 nats or more.
 EMPTY_KL = 0.1  # nats
 EMPTY_EXPLAINED = 0.01
 
@@ -45,25 +45,25 @@ class EventVAE(nn.Module):
 
     Args:
         variant: "bytestream" sees t, x, y, p; "bytestream_xy" sees x, y alone; "event_image_vae" sees event
-            images through convolutions, which leave norm, time_bins and coding without use.
+            images through convolutions, and does not use norm, time_bins and coding.
         width, height: Pixels of the sensor.
         context: Features of the context vector, even.
         latent: Size of z.
         norm: "batch" or "none": normalisation of the context network.
-        target: What is reconstructed: "signed" (Tanh, smooth L1), "occupancy" or "aged" (Sigmoid,
+        target: Reconstructed quantity: "signed" (Tanh, smooth L1), "occupancy" or "aged" (Sigmoid,
             binary cross entropy), or "counts" (linear, mean squared error), see `event_targets`; or
-            "proximity" of obstacles in sectors (Sigmoid, binary cross entropy), which is given.
+            "proximity" of obstacles in sectors (Sigmoid, binary cross entropy), supplied by the caller.
         time_bins: Resolution of time within a window, part of the model.
         coding: How the time of an event enters the context: "additive" (sines and cosines),
             "eventnet" (decay and rotation, twice the numbers) or "none"; "bytestream_xy" has no time
             and takes "additive" as "none".
-        pool_rank: Which value of a feature over the events the context holds: 1, the largest (appendix A.1),
-            or the second, third, ... largest, so that single false events cannot raise it.
-        octaves: Of sines and cosines of x and y that the per-event network reads beside x and y; 0: none
-            (appendix A.1).
+        pool_rank: Rank of each feature's value over the events that the context holds: 1, the largest
+            (appendix A.1), or 2, 3, ..., so that single false events cannot raise it.
+        octaves: Number of octaves of sines and cosines of x and y that the per-event network reads in
+            addition to x and y; 0: none (appendix A.1).
 
     Raises:
-        ValueError: A setting outside its range; the message names it.
+        ValueError: A setting is outside its range; the message names it.
     """
 
     def __init__(  # noqa: PLR0913 - the settings of an encoder file
@@ -106,46 +106,46 @@ class EventVAE(nn.Module):
 
     @classmethod
     def of(cls, settings: EvaeSettings) -> "EventVAE":
-        """Return the untrained model of some settings."""
+        """Build an untrained model with these settings."""
         return cls(**dataclasses.asdict(settings))
 
     def forward(self, batch: EventBatch, noise: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
         """Reconstruct a batch of windows.
 
         Args:
-            batch: Windows, made with this model's `grid`.
+            batch: Windows on this model's `grid`.
             noise: Standard normal (B, latent) for z = mu + noise exp(logvar / 2); None: z = mu.
 
         Returns:
-            Logits (B, outputs) of `reconstruct`, mu (B, latent), logvar (B, latent); there are
-            as many outputs as `target_shape` holds.
+            Logits (B, outputs) for `reconstruct`, mu (B, latent), logvar (B, latent); `outputs` is
+            the size of `target_shape`.
         """
         mu, logvar = self.encoder(self.ecn(batch)).chunk(2, dim=-1)
         z = mu if noise is None else mu + noise * torch.exp(0.5 * logvar.clamp(-30.0, LOGVAR_LIMIT))
         return self.decoder(z), mu, logvar
 
     def freeze(self) -> "EventVAE":
-        """Set eval mode, and let no parameter or running statistic move any more; return self."""
+        """Set eval mode and fix all parameters and running statistics; return self."""
         return self.eval().requires_grad_(False)
 
 
 def target_shape(target: str, grid: Grid) -> tuple[int, ...]:
-    """Shape of a window's target: a picture (H, W); "counts" (2, CELLS, CELLS); "proximity" (SECTORS,)."""
+    """Return a target's shape: a picture (H, W), "counts" (2, CELLS, CELLS) or "proximity" (SECTORS,)."""
     own = {"counts": (2, CELLS, CELLS), "proximity": (SECTORS,)}
     return own.get(target, (grid.height, grid.width))
 
 
 def event_targets(batch: EventBatch, target: str) -> Tensor:
-    """Return pictures that the decoder learns, float32 (B, outputs), row-major (`target_shape`).
+    """Return the decoder's targets, float32 (B, outputs), row-major (`target_shape`).
 
     "signed": polarity of each pixel's last event, -1, 0 or +1. "occupancy": 1 where the pixel
-    had any event, else 0. "aged": where it had any, the time of its newest one in (0, 1), newest
-    near 1, else 0. These follow from the set of events alone, as the context does: an
-    event that occurs twice counts once. Events of a window are taken in their given (time) order.
-    "counts": log2(1 + count) / COUNTED_BITS of the OFF, then the ON events of each cell.
+    had any event, else 0. "aged": the time of the pixel's newest event in (0, 1), newest near 1,
+    or 0 without events. Like the context, these three depend only on the set of events: an event
+    that occurs twice counts once. Events of a window are taken in their given (time) order.
+    "counts": log2(1 + count) / COUNTED_BITS of the OFF events, then of the ON events of each cell.
 
     Raises:
-        ValueError: The target is "proximity", which events do not say.
+        ValueError: The target is "proximity", which events do not determine.
     """
     if target == "proximity":
         rule = "must be one that events alone tell: signed, occupancy, aged or counts"
@@ -159,9 +159,9 @@ def event_targets(batch: EventBatch, target: str) -> Tensor:
 
 
 def reconstruction_loss(logits: Tensor, targets: Tensor, target: str) -> Tensor:
-    """Return mean over windows and outputs of the target's error, see `EventVAE`.
+    """Return the target's error (see `EventVAE`), averaged over windows and outputs.
 
-    The cross entropy takes logits because sigmoid followed by log is infinite from 17 on.
+    The cross entropy takes logits because sigmoid followed by log is infinite for logits from 17 on.
     """
     if target == "signed":
         return functional.smooth_l1_loss(torch.tanh(logits), targets)
@@ -171,17 +171,17 @@ def reconstruction_loss(logits: Tensor, targets: Tensor, target: str) -> Tensor:
 
 
 def reconstruct(logits: Tensor, target: str) -> Tensor:
-    """Return a target's values from logits: Tanh, Sigmoid (appendix A.1), or the logits themselves."""
+    """Convert logits to a target's values: Tanh, Sigmoid (appendix A.1), or the logits themselves."""
     if target == "counts":
         return logits
     return torch.tanh(logits) if target == "signed" else torch.sigmoid(logits)
 
 
 def pictures(values: Tensor, target: str, grid: Grid) -> Tensor:
-    """Return values of a target (B, outputs) as pictures to look at, (B, H, W) in about [-1, 1].
+    """Return values of a target (B, outputs) as pictures for display, (B, H, W) in about [-1, 1].
 
-    Of "counts" each pixel shows its cell: the larger of ON and, below 0, OFF. Of "proximity" each column of
-    pixels shows its sector.
+    For "counts" each pixel shows the larger count of its cell: ON as a positive, OFF as a negative value. For
+    "proximity" each column of pixels shows its sector.
     """
     shaped = values.reshape(-1, *target_shape(target, grid))
     if target == "proximity":
@@ -197,9 +197,9 @@ def pictures(values: Tensor, target: str, grid: Grid) -> Tensor:
 def kl_divergence(mu: Tensor, logvar: Tensor) -> Tensor:
     """Return KL( N(mu, exp(logvar)) || N(0, 1) ) of each window, summed over the latent: (B,).
 
-    0.5 (mu^2 + expm1(logvar) - logvar), which keeps small values that 1 + logvar - exp(logvar)
-    cancels. Above logvar 10 exp continues along its tangent, so that value and gradient stay
-    finite and point back.
+    Computed as 0.5 (mu^2 + expm1(logvar) - logvar), because 1 + logvar - exp(logvar) would cancel
+    small values. Above logvar 10 exp continues along its tangent, so that value and gradient stay
+    finite and the gradient points back.
     """
     bounded = logvar.clamp_max(LOGVAR_LIMIT)
     exp_minus_1 = torch.expm1(bounded) + torch.exp(bounded.detach()) * (logvar - bounded)
@@ -209,7 +209,7 @@ def kl_divergence(mu: Tensor, logvar: Tensor) -> Tensor:
 def appendix_beta(iteration: int) -> float:
     """Return the appendix's KL weight (B.2): 0 up to iteration 1000, then 1e-3 * iteration / 10000.
 
-    The appendix leaves iteration 1000 open; it is 0 here.
+    The appendix does not define iteration 1000; here the weight is 0.
     """
     return 0.0 if iteration <= 1000 else 1e-3 * iteration / 10_000
 
@@ -218,19 +218,19 @@ def train_step(
     evae: EventVAE, optimizer: torch.optim.Optimizer, batch: EventBatch, targets: Tensor, beta: float,
     rng: np.random.Generator, max_norm: float = 1.0,
 ) -> dict[str, float]:  # fmt: skip
-    """Take one update of the model on one batch.
+    """Update the model on one batch.
 
     Args:
         evae: Model in train mode.
-        optimizer: Over its parameters.
-        batch: Windows, at least two events together.
-        targets: As of `event_targets`, on the model's device.
+        optimizer: Optimiser of the model's parameters.
+        batch: Windows with at least two events in total.
+        targets: From `event_targets`, on the model's device.
         beta: KL weight on the scale of this module's loss.
         rng: Draws the noise of the latent.
         max_norm: The gradient's norm is clipped to this.
 
     Returns:
-        loss, reconstruction, kl (mean over windows), active_units, gradient_norm (before the clip).
+        loss, reconstruction, kl (mean over windows), active_units, gradient_norm (before clipping).
 
     Raises:
         RuntimeError: The gradient is not finite; no parameter has been changed.
@@ -250,15 +250,15 @@ def train_step(
 
 @torch.no_grad()
 def validate(evae: EventVAE, batch: EventBatch, targets: Tensor) -> dict[str, float]:
-    """Return figures of the model on held-out windows, z = mu; the model must be in eval mode.
+    """Return metrics of the model on held-out windows with z = mu; the model must be in eval mode.
 
     Returns:
         reconstruction (mean error of a pixel), mean_picture (the same error for the targets' own
         mean picture), explained_loss (1 - reconstruction / mean_picture: 0 for a model that has learnt
-        nothing of the single window, 1 for a perfect one, and 0 where all targets are the same;
-        of "aged" none reaches 1: the cross entropy keeps the entropy of times between 0 and 1),
-        auc (`ranking_area` of "the target is not 0", or is above `NEAR`, by its magnitude), kl (mean over
-        windows [nats]), active_units.
+        nothing about the single window, 1 for a perfect one, and 0 if all targets are the same;
+        "aged" never reaches 1, because the cross entropy of times between 0 and 1 is not 0),
+        auc (`ranking_area` of the reconstruction's magnitude, where targets above `NEAR`, or other
+        than 0, are the positives), kl (mean over windows [nats]), active_units.
     """
     logits, mu, logvar = evae(batch)
     mean = targets.mean(0).expand_as(targets)
@@ -284,16 +284,16 @@ def validate(evae: EventVAE, batch: EventBatch, targets: Tensor) -> dict[str, fl
 
 
 def ranking_area(scores: np.ndarray, positive: np.ndarray) -> float:
-    """Return area under the ROC curve: how often a positive has the higher score of a random pair.
+    """Return the area under the ROC curve: how often a positive scores higher than a negative.
 
-    Exact: the share of the pairs (positive, negative), a tie counts half (Mann and Whitney 1947).
+    Exact: the fraction over all pairs, where a tie counts half (Mann and Whitney 1947).
 
     Args:
         scores: Any shape, without NaN.
         positive: bool, the same shape.
 
     Returns:
-        0..1; 0.5, as of scores that say nothing, if all or none are positive.
+        0..1; 0.5 (uninformative) if all or none are positive.
 
     Raises:
         ValueError: A score is NaN, which has no rank.
@@ -308,19 +308,19 @@ def ranking_area(scores: np.ndarray, positive: np.ndarray) -> float:
 
 
 def collapsed(figures: Mapping[str, float]) -> bool:
-    """Whether the posterior has fallen onto the prior, so that the latent says nothing of its window.
+    """Whether the posterior has collapsed onto the prior, so that the latent carries no information.
 
-    Nothing of the single window is decoded (`EMPTY_EXPLAINED`), and the latent is either the same
-    for every window (no active unit) or next to the prior (`EMPTY_KL`). Both are asked, because a
-    latent without a KL term may live on a small scale, and a young model decodes nothing yet.
+    True if nothing of the single window is decoded (`EMPTY_EXPLAINED`), and the latent is either the same
+    for every window (no active unit) or close to the prior (`EMPTY_KL`). Both are required, because a
+    latent without a KL term may have a small scale, and a model early in training decodes nothing yet.
 
     Args:
-        figures: Of `validate`.
+        figures: Metrics from `validate`.
     """
     silent = figures["active_units"] == 0 or figures["kl"] < EMPTY_KL
     return silent and figures["explained_loss"] < EMPTY_EXPLAINED
 
 
 def active_units(mu: Tensor) -> float:
-    """Return how many latent units vary by more than 0.01 over the windows of `mu` (B, latent)."""
+    """Return the number of latent units whose variance over the windows of `mu` (B, latent) exceeds 0.01."""
     return float((mu.detach().var(0, correction=0) > ACTIVE_VARIANCE).sum())

@@ -1,6 +1,6 @@
-"""Events as addresses: windows of raw events become table indices, checked once at the border.
+"""Convert windows of raw events to table indices (addresses), checked once on entry.
 
-x, y, p and the time bin take finitely many values (appendix C), so that an event is two small
+x, y, p and the time bin take finitely many values (appendix C), so an event is two small
 integers. Training (`EventBatch`) and the frozen table read the same addresses.
 """
 
@@ -27,7 +27,7 @@ class Grid(NamedTuple):
 
 
 class Span(NamedTuple):
-    """When a window begins on the clock of its events, and how long it is [us]."""
+    """Start of a window on the clock of its events, and its length [us]."""
 
     start_us: int
     window_us: int
@@ -35,10 +35,10 @@ class Span(NamedTuple):
 
 @dataclass(frozen=True)
 class EventBatch:
-    """Windows of events as addresses; empty windows and mixed sizes are welcome.
+    """Windows of events as addresses; windows may be empty and of different sizes.
 
     Attributes:
-        grid: What the addresses mean.
+        grid: Sensor size and time bins of the addresses.
         code: int32 (N,): ((p > 0) * height + y) * width + x.
         bin: int32 (N,): time bin in the event's own window.
         offsets: int64 (B + 1,): window b holds events offsets[b] .. offsets[b + 1] - 1.
@@ -50,7 +50,7 @@ class EventBatch:
     offsets: np.ndarray
 
     def __post_init__(self) -> None:
-        """Refuse addresses that would make a kernel read outside its tables."""
+        """Raise ValueError for addresses that would make a kernel read outside its tables."""
         limits = (
             ("code", self.code, 2 * self.grid.width * self.grid.height),
             ("bin", self.bin, self.grid.time_bins),
@@ -68,13 +68,13 @@ class EventBatch:
 
     @classmethod
     def known(cls, grid: Grid, address: np.ndarray, offsets: np.ndarray) -> "EventBatch":
-        """Return a batch of addresses (2, N) that this file has computed, which need no second look."""
+        """Return a batch of addresses (2, N) that this module has computed, without checking them."""
         batch = object.__new__(cls)
         batch.__dict__.update(grid=grid, code=address[0], bin=address[1], offsets=offsets)
         return batch
 
     def __len__(self) -> int:
-        """Return number of windows."""
+        """Return the number of windows."""
         return len(self.offsets) - 1
 
     @property
@@ -108,12 +108,12 @@ def _within(values: np.ndarray, limit: int) -> bool:
 
 
 def address_events(events: Any, start_us: int, window_us: int, grid: Grid) -> np.ndarray:
-    """Compute `index_events` of events whose fields t, x, y, p have names."""
+    """Run `index_events` on events with named fields t, x, y, p."""
     return index_events(tuple(events[name] for name in "txyp"), start_us, window_us, grid)
 
 
 def index_events(fields: tuple[np.ndarray, ...], start_us: int, window_us: int, grid: Grid) -> np.ndarray:
-    """Return addresses of one window's events.
+    """Return the addresses of one window's events.
 
     Args:
         fields: t [us], x, y [pixels], p (-1 or +1): integer arrays (N,) in this order.
@@ -125,8 +125,8 @@ def index_events(fields: tuple[np.ndarray, ...], start_us: int, window_us: int, 
         int32 (2, N): code and time bin, as in `EventBatch`.
 
     Raises:
-        ValueError: A field is not integer, an event lies off the sensor or has another
-            polarity, or the window has no length.
+        ValueError: A field is not integer, an event lies outside the sensor, p is not -1 or +1,
+            or the length of the window is out of range.
     """
     for name, values in zip("txyp", fields, strict=True):
         if values.dtype.kind not in "iu":
@@ -144,7 +144,7 @@ def index_events(fields: tuple[np.ndarray, ...], start_us: int, window_us: int, 
 
 @numba.njit(cache=True, error_model="numpy")
 def _index(t, x, y, p, span, grid, address) -> int:  # type: ignore[no-untyped-def]
-    """Fill `address` (2, N); the index of the first refused event, or -1."""
+    """Fill `address` (2, N); return the index of the first invalid event, or -1."""
     width, height = grid.width, grid.height
     for n in range(len(t)):
         column, row, sign = np.int64(x[n]), np.int64(y[n]), np.int64(p[n])
@@ -159,22 +159,23 @@ def batch_windows(windows: Iterable[tuple[Any, int, int]], grid: Grid) -> EventB
     """Batch windows given as (events, start_us, window_us); events as in `address_events`.
 
     Raises:
-        ValueError: As `index_events`.
+        ValueError: As in `index_events`.
     """
     return _join([address_events(*window, grid) for window in windows], grid)
 
 
 def batch_packed(windows: np.ndarray | Sequence[np.ndarray], grid: Grid) -> EventBatch:
-    """Batch packed windows of any lengths, by one compiled call.
+    """Batch packed windows of any lengths in one compiled call.
 
     Args:
         windows: Each an int32 (rows, 4): row 0 is [count, dropped, window_us, 0], the next `count`
-            rows are [t - start, x, y, p]. A window without events may be all zeros. A stack of
-            equally long ones (B, capacity + 1, 4) is not copied.
+            rows are [t - start, x, y, p]. A window without events may be all zeros. One array
+            (B, capacity + 1, 4) of equally long windows is not copied.
         grid: Sensor size and time bins.
 
     Raises:
-        ValueError: Wrong shape or dtype, a count beyond the rows, or as `index_events`; it names the window.
+        ValueError: Wrong shape or dtype, a count larger than the rows, or as in `index_events`; the message
+            names the window.
     """
     rows, starts = _flat_rows(windows)
     address, offsets, bad = _index_packed(rows, starts, grid)
@@ -184,7 +185,7 @@ def batch_packed(windows: np.ndarray | Sequence[np.ndarray], grid: Grid) -> Even
 
 
 def _flat_rows(windows: np.ndarray | Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rows (R, 4) of all windows, and where each window starts and the last ends (B + 1,)."""
+    """Return the rows (R, 4) of all windows, and each window's start and the last one's end (B + 1,)."""
     for number, window in enumerate(windows):
         if window.shape[1:] != (4,) or not len(window) or window.dtype.kind != "i":
             rule = "a packed window is int32 (count + 1, 4)"
@@ -197,7 +198,7 @@ def _flat_rows(windows: np.ndarray | Sequence[np.ndarray]) -> tuple[np.ndarray, 
 
 @numba.njit(cache=True, error_model="numpy")
 def _index_packed(rows, starts, grid):  # type: ignore[no-untyped-def]
-    """Return addresses int32 (2, N), offsets (B + 1,), and the first refused window or -1."""
+    """Return addresses int32 (2, N), offsets (B + 1,), and the first invalid window or -1."""
     offsets = np.zeros(len(starts), np.int64)
     for b in range(len(starts) - 1):
         count, window_us = rows[starts[b], 0], rows[starts[b], 2]
@@ -216,7 +217,7 @@ def _index_packed(rows, starts, grid):  # type: ignore[no-untyped-def]
 
 
 def _refuse(number: int, window: np.ndarray, grid: Grid) -> None:
-    """Raise ValueError with what `_index_packed` refused in a window."""
+    """Raise ValueError with the reason why `_index_packed` rejected a window."""
     count, window_us = int(window[0, 0]), int(window[0, 2])
     if not 0 <= count < len(window):
         raise ValueError(f"window {number} announces {count} events, its capacity is {len(window) - 1}")
@@ -227,14 +228,14 @@ def _refuse(number: int, window: np.ndarray, grid: Grid) -> None:
 
 
 def cut_packed(window: np.ndarray) -> np.ndarray:
-    """Return the used rows of a packed window, int32 (count + 1, 4), as a copy to keep."""
+    """Return a copy of the used rows of a packed window, int32 (count + 1, 4)."""
     return window[: int(window[0, 0]) + 1].copy()
 
 
 def thin(batch: EventBatch, most: int) -> EventBatch:
-    """Return at most `most` events of each window, evenly over their order.
+    """Return at most `most` events of each window, spread evenly over their order.
 
-    Of N > most the one in the middle of each of `most` equal parts is kept.
+    A larger window is divided into `most` equal parts; the middle event of each part is returned.
     """
     counts = np.diff(batch.offsets)
     if counts.max(initial=0) <= most:
@@ -251,8 +252,8 @@ def thin(batch: EventBatch, most: int) -> EventBatch:
 def event_rows(batch: EventBatch, size: int) -> np.ndarray:
     """Return windows as arrays of fixed size, int16 (B, size, 4): [kind, time bin, x, y] of each event.
 
-    kind is 1 for ON, 2 for OFF, 0 for no event: the rows after those of the window's events. Assumes at
-    most `size` events in each window, and sides and time bins of at most 2^15.
+    kind is 1 for ON, 2 for OFF, and 0 for the empty rows after the window's last event. Assumes at most
+    `size` events in each window, and width, height and time bins of at most 2^15.
     """
     rows = np.zeros((len(batch), size, 4), np.int16)
     _roll(batch.code, batch.bin, batch.offsets, batch.grid, rows)
@@ -271,10 +272,10 @@ def _roll(code, bins, offsets, grid, rows) -> None:  # type: ignore[no-untyped-d
 
 
 def batch_rows(rows: np.ndarray, grid: Grid) -> EventBatch:
-    """Batch windows given as `event_rows`, integers (B, size, 4); rows without an event are left out.
+    """Batch windows in the format of `event_rows`, integers (B, size, 4); skip empty rows.
 
     Raises:
-        ValueError: A row is no event of the grid.
+        ValueError: A row is not an event of the grid.
     """
     address = np.empty((2, rows.shape[0] * rows.shape[1]), np.int32)
     offsets = np.zeros(len(rows) + 1, np.int64)
@@ -288,7 +289,7 @@ def batch_rows(rows: np.ndarray, grid: Grid) -> EventBatch:
 
 @numba.njit(cache=True, error_model="numpy")
 def _unroll(rows, grid, address, offsets) -> int:  # type: ignore[no-untyped-def]
-    """Fill `address` and `offsets`; the index of the first refused row, or -1."""
+    """Fill `address` and `offsets`; return the index of the first invalid row, or -1."""
     width, height = grid.width, grid.height
     found = 0
     for b in range(rows.shape[0]):
@@ -308,10 +309,10 @@ def _unroll(rows, grid, address, offsets) -> int:  # type: ignore[no-untyped-def
 
 
 def distinct(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return distinct non-negative integers, how often each occurs, and the place of each value among them.
+    """Return the distinct values of non-negative integers, their counts, and the index of each value in them.
 
     Returns:
-        present (U,) in rising order, multiplicity (U,), rank int32 (N,) with present[rank] == values.
+        present (U,) in ascending order, multiplicity (U,), rank int32 (N,) with present[rank] == values.
     """
     multiplicity = np.bincount(values)
     present = np.flatnonzero(multiplicity)
@@ -327,5 +328,5 @@ def _join(parts: list[np.ndarray], grid: Grid) -> EventBatch:
 
 
 def _sums(sizes: list[int]) -> np.ndarray:
-    """Return 0 and the running sums of sizes, int64 (B + 1,); for few, faster than numpy."""
+    """Return 0 and the running sums of sizes, int64 (B + 1,); faster than numpy for short lists."""
     return np.array(list(itertools.accumulate(sizes, initial=0)), np.int64)

@@ -1,9 +1,9 @@
 """Event images: how they are drawn from events, and an encoder of convolutions over them.
 
-The encoder is that of the policy `event_image_vae` (EIVAE in appendix D.1.2): a variational
-autoencoder whose encoder has the convolutions of `event_image`. Here each step's image has a latent
-of its own and the policy sees a stack of latents, as `bytestream` does; the paper encodes the stack
-of images. So these two policies differ only in what the encoder sees.
+The policy `event_image_vae` (EIVAE in appendix D.1.2) uses this encoder, a variational
+autoencoder with the convolutions of `event_image`. Here each step's image is encoded on its own and
+the policy sees a stack of latents, like `bytestream`; the paper encodes the stack of images. So
+`event_image_vae` and `bytestream` differ only in what the encoder sees.
 """
 
 import math
@@ -24,14 +24,14 @@ OFF_SHARE = GREY_OFF / GREY_ON
 
 
 class PictureContextNetwork(nn.Module):
-    """Event image to context: the convolutions of `nature_layers`.
+    """Map an event image to a context by the convolutions of `nature_layers`.
 
     Args:
-        grid: Sensor size; time is not seen.
+        grid: Sensor size; time bins are not used.
         context: Features D.
 
     Raises:
-        ValueError: The sensor has fewer than 36 pixels each way.
+        ValueError: Width or height of the sensor is below 36 pixels.
     """
 
     def __init__(self, grid: Grid, context: int) -> None:
@@ -43,7 +43,7 @@ class PictureContextNetwork(nn.Module):
         self.grid = grid
         self.layers = nn.Sequential(*nature_layers((1, grid.height, grid.width), context))
         for layer in self.layers:
-            if isinstance(layer, nn.Conv2d | nn.Linear):  # torch's own weights let sparse pictures fade
+            if isinstance(layer, nn.Conv2d | nn.Linear):  # sparse pictures fade with torch's initial weights
                 orthogonal_(layer.weight, math.sqrt(2.0))
                 nn.init.zeros_(layer.bias)
 
@@ -56,7 +56,7 @@ def nature_layers(shape: Sequence[int], outputs: int) -> list[nn.Module]:
     """Return three convolutions and a dense layer with the sizes of Mnih et al. (Nature 2015).
 
     Args:
-        shape: Channels, height and width of a picture, `models.kinds.MIN_IMAGE` pixels each way.
+        shape: Channels, height and width of a picture, at least `models.kinds.MIN_IMAGE` pixels each way.
         outputs: Features of the last layer.
     """
     channels, *sides = shape
@@ -71,14 +71,14 @@ def nature_layers(shape: Sequence[int], outputs: int) -> list[nn.Module]:
 
 
 def last_polarity(batch: EventBatch) -> np.ndarray:
-    """Return polarity of each pixel's last event, -1, 0 or +1: float32 (B, H W), row-major."""
+    """Return the polarity of each pixel's last event, -1, 0 or +1: float32 (B, H W), row-major."""
     pictures = np.zeros((len(batch), batch.grid.width * batch.grid.height), np.float32)
     _draw_windows(batch.code, batch.offsets, pictures)
     return pictures
 
 
 def newest_time(batch: EventBatch) -> np.ndarray:
-    """Return time of each pixel's newest event within its window, 0 where there is none: float32 (B, H W).
+    """Return the time of each pixel's newest event within its window, 0 if there is none: float32 (B, H W).
 
     Times are the centres of their bins, in (0, 1), newest near 1.
     """
@@ -111,7 +111,7 @@ def event_pictures(batch: EventBatch) -> Tensor:
 
 @numba.njit(cache=True, error_model="numpy")
 def draw_last(code, picture, on, off) -> None:  # type: ignore[no-untyped-def]
-    """Set each pixel of `picture` (H W,) to `on` or `off` by its last event; others stay as they are."""
+    """Set each pixel of `picture` (H W,) to `on` or `off` by its last event; leave other pixels unchanged."""
     for n in range(len(code)):
         picture[code[n] % len(picture)] = on if code[n] >= len(picture) else off
 
@@ -123,20 +123,20 @@ def _draw_windows(code, offsets, pictures) -> None:  # type: ignore[no-untyped-d
 
 
 class PictureEncoder:
-    """Its frozen encoder: windows to latents, with the methods of `models.encoder.table.EncoderTable`."""
+    """Frozen encoder of event images, with the methods of `models.encoder.table.EncoderTable`."""
 
     def __init__(self, evae: Any) -> None:
-        """Take the parts of an `EventVAE` of variant "event_image_vae"."""
+        """Use the layers of an `EventVAE` of variant "event_image_vae"."""
         self.grid, self.latent_size = evae.grid, evae.settings.latent
         self.layers = nn.Sequential(evae.ecn.layers, evae.encoder).eval()
         self._run = packed(self.layers)
 
     def encode(self, events: Any, start_us: int, window_us: int) -> np.ndarray:
-        """Return latent mu (latent,) of one window. Raises ValueError as `event_batch.index_events`."""
+        """Return latent mu (latent,) of one window. Raises ValueError as in `index_events`."""
         return self.encode_batch(batch_windows([(events, start_us, window_us)], self.grid))[0]
 
     def encode_windows(self, windows: np.ndarray | Sequence[np.ndarray]) -> np.ndarray:
-        """Return latents (B, latent) of packed windows. Raises ValueError as `event_batch.batch_packed`."""
+        """Return latents (B, latent) of packed windows. Raises ValueError as in `batch_packed`."""
         return self.encode_batch(batch_packed(windows, self.grid))
 
     def encode_batch(self, batch: EventBatch) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The encoder half of an event VAE, events to latent: the frozen part of a policy, and its table."""
+"""The encoder half of an event VAE (events to latent): the frozen part of a policy, and its lookup table."""
 
 import math
 
@@ -28,15 +28,15 @@ def encoder_part(evae: EventVAE) -> nn.ModuleDict:
 
 
 def read_encoder_part(path: str, digest: str, settings: EvaeSettings) -> nn.ModuleDict:
-    """Return the `encoder_part` of an encoder file, or one full of NaN if that file is not there.
+    """Return the `encoder_part` of an encoder file, filled with NaN if the file is missing.
 
-    A checkpoint may be opened where its encoder file no longer exists; its own state then
-    replaces the NaN, and `tabulate` refuses any that are left.
+    A checkpoint may be opened where its encoder file no longer exists. The checkpoint's own state
+    then replaces the NaN; `tabulate` raises an error if any is left.
 
     Args:
         path: The encoder file.
         digest: Its SHA-256; a file with another digest counts as missing.
-        settings: Of its event VAE.
+        settings: Settings of the event VAE.
     """
     try:
         evae, manifest = load_encoder(path)
@@ -58,10 +58,10 @@ def encoder_of(evae: EventVAE) -> Encoder:
 
 
 def tabulate(part: nn.Module, settings: EvaeSettings) -> Encoder:
-    """Return the frozen encoder of an `encoder_part` or a `FinetunedEncoder`, of a model with these settings.
+    """Return the frozen encoder of an `encoder_part` or a `FinetunedEncoder` with these model settings.
 
     Raises:
-        ValueError: The part was never given its weights.
+        ValueError: A weight is not finite: the weights were never loaded.
     """
     if not all(torch.isfinite(value).all() for value in part.state_dict().values()):
         raise ValueError("encoder must have finite weights, got NaN: its file is missing or changed")

@@ -1,7 +1,7 @@
-"""The maximum over events, or a lower rank, by operations of torch for a GPU (`models.encoder.context`).
+"""The maximum over events, or a lower rank, as torch operations for a GPU (see `models.encoder.context`).
 
-All sums of a feature and a code are made at once (4 N D bytes) and searched window by window; the gradient
-then follows the winners alone. Sums and maxima are rounded as on a processor.
+All sums of a feature and a code are computed at once (4 N D bytes) and searched window by window; the
+gradient then flows to the winners alone. Sums and maxima are rounded as on a CPU.
 """
 
 import numpy as np
@@ -19,15 +19,15 @@ def max_context(
     """Return the rank-th largest over a window's events of ReLU(features[cell] + codes[bin]).
 
     Args:
-        features: Of each cell (U, D), >= 0, on any device.
-        codes: Of each time bin (T, D), in the precision of the features.
+        features: Features of each cell (U, D), >= 0, on any device.
+        codes: Code of each time bin (T, D), in the precision of the features.
         address: Cell and time bin of each event, integers (N,) each.
         offsets: Window b holds events offsets[b] .. offsets[b + 1] - 1, int64 (B + 1,).
-        rank: 1 for the largest; a window of fewer events has the context 0.
+        rank: 1 for the largest; a window with fewer events has the context 0.
 
     Returns:
-        Context (B, D) with a gradient, and the bin int64 (B, D) of the event that it is from, of equal ones
-        the first in the order of ranks, 0 without one.
+        Contexts (B, D) with a gradient, and the time bin int64 (B, D) of the event behind each value, 0 if
+        there is none. Equal values rank in the order of their events.
     """
     cell, bins = (torch.from_numpy(part).to(features.device, torch.int64) for part in address)
     code = torch.tensor(codes, device=features.device)
@@ -47,7 +47,7 @@ def max_context(
 
 
 def _of_rank(values: Tensor, rank: int) -> tuple[Tensor, Tensor]:
-    """Return the rank-th largest of each column (D,) and its row; equal values stay in order."""
+    """Return the rank-th largest value of each column (D,) and its row; equal values rank in row order."""
     if rank == 1:
         return torch.max(values, 0)
     ordered, rows = torch.sort(values, dim=0, descending=True, stable=True)

@@ -1,14 +1,14 @@
-"""Matrix products whose digits follow from this file alone, not from the processor or the number of threads.
+"""Matrix products with the same bits on every processor and for any number of threads.
 
-A library of linear algebra picks its kernels by the processor's maker and instructions, and each adds in an
-order of its own: the same training then ends with other weights. Here each element is one chain of fused
-multiply-adds in rising order of the inner index, from the element's first value:
+A linear algebra library picks its kernels by the processor's vendor and instructions, and each kernel sums
+in its own order: the same training then ends with other weights. Here each element is one chain of fused
+multiply-adds in ascending order of the inner index, starting from the element's initial value:
 
     out[i, j] = fma(a[i, K-1], b[K-1, j], ... fma(a[i, 1], b[1, j], fma(a[i, 0], b[0, j], out[i, j])))
 
-Vector registers hold neighbouring columns, blocks continue the chains of earlier ones, and threads share the
-rows or columns: none of this changes an order. Element by element it errs by at most K times the rounding
-error of sum |a| |b|, as any order does. The blocks are those of Goto and van de Geijn (2008).
+Vector registers hold neighbouring columns, each block continues the chains of the previous block, and threads
+divide the rows or columns: none of this changes the order of a sum. The error of each element is at most K
+times the rounding error of sum |a| |b|, as in any order. The blocks follow Goto and van de Geijn (2008).
 """
 
 import functools
@@ -25,13 +25,13 @@ from numba.extending import intrinsic
 from torch import Tensor, nn
 from torch.nn import functional
 
-ROWS = 6  # of a tile: with a line of columns its sums fill the registers of AVX2
+ROWS = 6  # rows of a tile: with one line of columns its sums fill the AVX2 registers
 LINE = 64  # bytes, one row of a tile
-DEPTH, HEIGHT = 1024, 192  # of a block: it stays in the second cache
-NEAR = 1 << 15  # bytes between its first and last line up to which a panel is not copied
-LINES = 4  # of a block of columns, read together
-CHAINS = 64  # of a `dot`
-SHARED = 1 << 21  # products of numbers from which a second thread is worth waking
+DEPTH, HEIGHT = 1024, 192  # size of a block, which stays in the L2 cache
+NEAR = 1 << 15  # bytes; a panel is copied if its first and last line are farther apart
+LINES = 4  # lines of a block of columns, read together
+CHAINS = 64  # parallel sums of `dot`
+SHARED = 1 << 21  # multiplications from which a second thread pays off
 
 
 def _emit_fma(builder: Any, *values: Any) -> Any:
@@ -44,13 +44,13 @@ def _emit_fma(builder: Any, *values: Any) -> Any:
 
 
 def _emit_moved(builder: Any, start: Any, steps: Any, stride: Any, kind: Any) -> Any:
-    """Emit a pointer to a `kind`, so many strides of bytes behind another."""
+    """Emit a pointer to a `kind`, `steps` strides [bytes] after `start`."""
     return builder.bitcast(builder.gep(start, [builder.mul(steps, stride)]), kind.as_pointer())
 
 
 @intrinsic
 def fma(typing: Any, a: Any, b: Any, c: Any) -> Any:
-    """Compute a * b + c with one rounding, of three floats of one type; on any processor the same."""
+    """Compute a * b + c of three floats of one type with one rounding, the same on every processor."""
 
     def emit(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         return _emit_fma(builder, *values)
@@ -64,8 +64,8 @@ def _add_tile(  # noqa: PLR0913 - two factors and a sum, and where in them
 ) -> Any:
     """Continue the chains of the tile of `out` at (row, column) by `depth` numbers of a[i:, k:] and `panel`.
 
-    With `anew` they begin at 0. Rows below the last one of `a` are taken to be that one. LLVM is given whole
-    vectors, because it may not reorder the sums of a loop to fill them itself.
+    With `anew` the chains start at 0. Rows beyond the last row of `a` repeat that row. The code emits whole
+    vectors, because LLVM may not reorder the sums of a loop to vectorise it.
     """
     size, index = out.dtype.bitwidth // 8, types.intp
 
@@ -110,7 +110,7 @@ def _add_tile(  # noqa: PLR0913 - two factors and a sum, and where in them
 
 @numba.njit(cache=True, error_model="numpy", nogil=True)
 def _copy(part, room) -> None:  # type: ignore[no-untyped-def]
-    """Copy a matrix into the first rows and columns of another, along the lines of memory of the first."""
+    """Copy a matrix into the first rows and columns of another, in the memory order of the source."""
     if part.strides[0] < part.strides[1]:
         for j in range(part.shape[1]):
             for i in range(part.shape[0]):
@@ -122,17 +122,17 @@ def _copy(part, room) -> None:  # type: ignore[no-untyped-def]
 
 
 def _of(number: Any) -> Any:
-    """Return the signature of `add_product` for matrices of a type of numbers, in any layout."""
+    """Return the signature of `add_product` for matrices of one number type, in any layout."""
     matrix = types.Array(number, 2, "A")
     return types.void(matrix, matrix, matrix, types.boolean)
 
 
 @numba.njit([_of(types.float32), _of(types.float64)], cache=True, error_model="numpy", nogil=True)
 def add_product(a, b, out, anew) -> None:  # type: ignore[no-untyped-def]  # noqa: C901 - loops over blocks
-    """Add a (M, K) @ b (K, N) to `out` (M, N) by one thread, in the order that this file states.
+    """Add a (M, K) @ b (K, N) to `out` (M, N) in one thread, in the order that the module's docstring states.
 
-    With `anew` its chains begin at 0, whatever `out` holds. Assumes the shapes, one type, float32 or float64,
-    and that `out` shares no memory with the others.
+    With `anew` the chains start at 0 instead of the values in `out`. Assumes matching shapes, one type,
+    float32 or float64, and that `out` shares no memory with `a` and `b`.
     """
     rows, columns, depths, lanes = out.shape[0], out.shape[1], a.shape[1], LINE // out.itemsize
     lines = 1 if b.strides[0] < b.strides[1] else max(1, min(LINES, -(-columns // lanes)))
@@ -140,7 +140,7 @@ def add_product(a, b, out, anew) -> None:  # type: ignore[no-untyped-def]  # noq
     in_line, near = out.strides[1] == out.itemsize, b.strides[1] == b.itemsize and b.strides[0] * most <= NEAR
     room = np.empty((ROWS + 1 + most) * wide, out.dtype)
     if columns % lanes:
-        room[:] = 0.0  # numbers in columns that are not there could be slow ones
+        room[:] = 0.0  # garbage in the padding columns could be denormal, which is slow
     room = room[-room.ctypes.data % LINE // out.itemsize :]
     corner, packed = room[: ROWS * wide].reshape((ROWS, wide)), room[ROWS * wide : (ROWS + most) * wide]
     far = a.strides[0] < a.strides[1] and a.strides[1] * most > NEAR
@@ -180,14 +180,14 @@ def add_rows(rows, out) -> None:  # type: ignore[no-untyped-def]
 
 
 def aligned(size: int) -> np.ndarray:
-    """Return an empty float32 (size,) that begins at a cache line, so that no vector crosses two."""
+    """Return an empty float32 (size,) aligned to a cache line, so that no vector crosses two lines."""
     room = np.empty(size + LINE // 4, np.float32)
     return room[-room.ctypes.data % LINE // 4 :][:size]
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True)
 def dot(a, b):  # type: ignore[no-untyped-def]
-    """Return the sum of products of two vectors: CHAINS of them side by side, then one after the other."""
+    """Return the dot product of two vectors: CHAINS partial sums in parallel, then added in order."""
     sums = np.zeros(CHAINS, a.dtype)
     whole = len(a) // CHAINS * CHAINS
     for k in range(0, whole, CHAINS):
@@ -203,15 +203,15 @@ def dot(a, b):  # type: ignore[no-untyped-def]
 
 @functools.lru_cache(maxsize=1)
 def _helpers(threads: int) -> ThreadPoolExecutor:
-    """Return threads that help the one that asks."""
+    """Return a pool of `threads - 1` threads that work alongside the calling thread."""
     return ThreadPoolExecutor(threads - 1)
 
 
-os.register_at_fork(after_in_child=_helpers.cache_clear)  # threads do not follow
+os.register_at_fork(after_in_child=_helpers.cache_clear)  # a fork does not copy threads
 
 
 def add_product_shared(a: np.ndarray, b: np.ndarray, out: np.ndarray, anew: bool) -> None:
-    """Run `add_product` on as many threads as torch has; they share the rows or columns of `out`."""
+    """Run `add_product` on as many threads as torch uses, which divide the rows or columns of `out`."""
     threads = torch.get_num_threads()
     if threads == 1 or out.size * len(b) < SHARED:
         add_product(a, b, out, anew)
@@ -230,7 +230,7 @@ def add_product_shared(a: np.ndarray, b: np.ndarray, out: np.ndarray, anew: bool
 
 
 class Product(torch.autograd.Function):
-    """a (M, K) @ b (K, N), plus a bias (N,) if there is one, on the processor; so are its gradients."""
+    """a (M, K) @ b (K, N), plus a bias (N,) if given, on the CPU, with gradients computed the same way."""
 
     @staticmethod
     def forward(ctx: Any, a: Tensor, b: Tensor, bias: Tensor | None) -> Tensor:
@@ -242,7 +242,7 @@ class Product(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        """Return gradients of those that need one, in the layout of their memory."""
+        """Return the gradients of the inputs that need one, in the memory layout of each input."""
         (a, b), (to_a, to_b, to_bias) = ctx.saved_tensors, ctx.needs_input_grad
         of_bias = gradient.new_zeros(gradient.shape[1]) if to_bias else None
         if of_bias is not None:
@@ -252,12 +252,12 @@ class Product(torch.autograd.Function):
 
 
 def product(a: Tensor, b: Tensor) -> Tensor:
-    """Compute a (M, K) @ b (K, N), with gradients; on a GPU by torch."""
+    """Compute a (M, K) @ b (K, N), with gradients. Uses torch on a GPU."""
     return Product.apply(a, b, None) if a.device.type == "cpu" else a @ b
 
 
 def _product_like(like: Tensor, a: Tensor, b: Tensor) -> Tensor:
-    """Compute a @ b, with the columns next to each other in memory where those of `like` are."""
+    """Compute a @ b in the memory layout (row- or column-major) of `like`."""
     if like.stride(0) < like.stride(1):
         return _product_like(like.T, b.T, a.T).T
     out = a.new_empty(len(a), b.shape[1])
@@ -268,7 +268,7 @@ def _product_like(like: Tensor, a: Tensor, b: Tensor) -> Tensor:
 def affine(inputs: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
     """Compute inputs (..., K) @ weight (M, K).T + bias (M,), with gradients.
 
-    By torch on a GPU, in an exported file, and for other numbers than float32 and float64.
+    Uses torch on a GPU, in exported files, and for types other than float32 and float64.
     """
     ours = inputs.device.type == "cpu" and inputs.dtype == weight.dtype in (torch.float32, torch.float64)
     if not ours or torch.compiler.is_compiling():
@@ -278,7 +278,7 @@ def affine(inputs: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
 
 
 class Linear(nn.Linear):
-    """A dense layer whose outputs and gradients are `affine`'s."""
+    """A dense layer computed by `affine`."""
 
     def forward(self, inputs: Tensor) -> Tensor:
         """Return outputs (..., M) of inputs (..., K)."""
@@ -286,7 +286,7 @@ class Linear(nn.Linear):
 
 
 class PackedLinear(nn.Module):
-    """A `Linear` of float32 by the weights of this moment, for a few rows at a time; the bytes are the same.
+    """A float32 `Linear` with its current weights packed, for a few rows at a time; same output bits.
 
     `add_product` packs its second factor in each call, which takes longer than the products of a few rows.
     """
@@ -321,31 +321,31 @@ class PackedLinear(nn.Module):
     nogil=True,
 )
 def _add_panels(a, panels, out) -> None:  # type: ignore[no-untyped-def]
-    """Add a (M, K) @ b to `out`, which has as many rows or up to ROWS - 1 more; b is packed into panels."""
+    """Add a (M, K) @ b to `out`, whose rows are M rounded up to a multiple of ROWS; `panels` is b packed."""
     for p in range(len(panels)):
         for i in range(0, len(out), ROWS):
             _add_tile(a, i, 0, panels[p], a.shape[1], out, i, p * panels.shape[2], False)
 
 
 def packed(network: nn.Module) -> nn.Module:
-    """Return a network whose dense layers are packed: a `Linear`, or those of an `nn.Sequential`.
+    """Return a network with packed dense layers: a `Linear`, or an `nn.Sequential` that contains some.
 
-    Other parts are the same objects. It runs on the processor.
+    Other layers are the same objects. The result runs on the CPU.
     """
     if type(network) is Linear and network.weight.dtype == torch.float32:
         return PackedLinear(network)
-    if type(network) is nn.Sequential:  # a class of its own may compute otherwise
+    if type(network) is nn.Sequential:  # a subclass may compute something else
         return nn.Sequential(*map(packed, network))
     return network
 
 
 def orthogonal_(weight: Tensor, gain: float, generator: torch.Generator | None = None) -> None:
-    """Fill a weight (M, ...) as `torch.nn.init.orthogonal_` does, by the same draws.
+    """Fill a weight (M, ...) as `torch.nn.init.orthogonal_` does, from the same random numbers.
 
-    LAPACK's QR rounds as its products do. Here Gram and Schmidt's, modified, runs in float64: rows or
-    columns, whichever are fewer, are orthonormal to the rounding of float32.
+    LAPACK's QR depends on the processor, like its products. Here modified Gram-Schmidt runs in float64: rows
+    or columns, whichever are fewer, are orthonormal to the rounding of float32.
     """
-    if weight.is_meta:  # only shapes are asked for
+    if weight.is_meta:  # only the shape is needed
         return
     drawn = torch.empty(len(weight), weight[0].numel()).normal_(generator=generator).double().numpy()
     tall = drawn.shape[0] >= drawn.shape[1]
@@ -357,7 +357,7 @@ def orthogonal_(weight: Tensor, gain: float, generator: torch.Generator | None =
 
 @numba.njit(cache=True, error_model="numpy")
 def _orthonormalise(vectors) -> None:  # type: ignore[no-untyped-def]
-    """Make the rows of a matrix orthonormal, each from those above it."""
+    """Orthonormalise the rows of a matrix in place, from the first to the last."""
     for i in range(len(vectors)):
         own = vectors[i]
         own /= np.sqrt(dot(own, own))

@@ -1,19 +1,19 @@
 """The frozen encoder as an exact lookup table (appendix C), also for streams (appendix A.3).
 
-x, y, p and the time bin are bounded: the context network is 2 H W rows of features and one row
+x, y, p and the time bin are bounded, so the context network is 2 H W rows of features and one row
 of embedding per time bin. A context is the maximum of their sums, floored at 0, so that
 
     context(any chunks of a window, in any order) == context(the window),   bit for bit:
 
 a sum is rounded the same in every chunk, and a maximum does not round. The rows are computed
 in float64 and rounded once, to the model's precision or a smaller one; `tests/models/encoder/test_table.py`
-states the distance to the module.
+states the bound on the difference from the model.
 
-With `pool_rank` r > 1 a context holds the r largest sums of each feature, (r, D): lists of the largest merge
-in any order, too, so chunks stay exact. The latent reads the r-th.
+With `pool_rank` r > 1 a context holds the r largest sums of each feature, (r, D). Such lists also merge in
+any order, so chunks stay exact. The latent reads the r-th sum.
 
-With EventNet's coding a context also holds the time bin of the event that each magnitude is from,
-of equal ones the newest; the phase of that bin follows when the latent is asked for.
+With EventNet's coding a context also holds the time bin of the event behind each magnitude, the
+newest in a tie. The phase of that bin is applied when the latent is computed.
 """
 
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ from models.encoder.event_batch import EventBatch, Grid, batch_packed, batch_win
 
 PRECISIONS = ("model", "int16", "int8")
 INT16_TOP, INT8_TOP = 32_767, 127
-BLOCK = 128  # features whose largest sums are sorted together; of 16 to 256 the quickest with 256 features
+BLOCK = 128  # features whose largest sums are sorted together; of 16 to 256 the fastest for 256 features
 
 
 @dataclass(frozen=True)
@@ -44,10 +44,10 @@ class EncoderTable:
         hidden: Weight (256, D or 2 D) and bias (256,) of the encoder's first layer; the weight
             takes a context in the units of the rows.
         head: Weight (latent, 256) and bias (latent,) of mu.
-        phase: Of each time bin, real and imaginary part (2, time_bins), for EventNet's coding.
-        pool_rank: Which of the largest sums of a feature the latent reads, see `models.encoder.context`.
-        most_events: A whole window is thinned to so many before it is encoded
-            (`models.encoder.event_batch.thin`), None: never. `update` takes every event of a stream.
+        phase: Real and imaginary part of each time bin's phase (2, time_bins), for EventNet's coding.
+        pool_rank: Rank of the sum of each feature that the latent reads, see `models.encoder.context`.
+        most_events: Whole windows are thinned to this number of events before they are encoded
+            (`models.encoder.event_batch.thin`); None: never. `update` uses every event of a stream.
     """
 
     grid: Grid
@@ -63,18 +63,18 @@ class EncoderTable:
     def from_evae(
         cls, evae: EventVAE, precision: str = "model", time_bins: int | None = None
     ) -> "EncoderTable":
-        """Tabulate a model by its running statistics.
+        """Tabulate a model, using its running statistics.
 
         Args:
             evae: The model.
-            precision: Of the rows. "model": the model's dtype (float32), exact. "int16": fixed
-                point with one scale for all, a power of two, of 2^-11 for features below 15;
-                it halves what an event reads, and is more exact than float16, which CPUs
-                would have to convert. "int8": one scale for each feature.
-            time_bins: Another resolution of time than the model's; None: the model's, exact.
+            precision: Number type of the rows. "model": the model's dtype (float32), exact.
+                "int16": fixed point with one scale for all rows, a power of two, 2^-11 for features
+                below 15; it halves the bytes read per event, and is more exact than float16, which
+                CPUs would have to convert. "int8": one scale for each feature.
+            time_bins: Resolution of time; None: the model's, exact.
 
         Raises:
-            ValueError: Unknown precision, time_bins out of the model's range, or weights that
+            ValueError: The precision is unknown, time_bins is out of the model's range, or the weights
                 are neither float32 nor float64.
         """
         if precision not in PRECISIONS:
@@ -104,10 +104,10 @@ class EncoderTable:
         )
 
     def empty(self) -> np.ndarray:
-        """Return the context of no event: zeros (D,), int16 for rows of int8, whose sums it holds.
+        """Return the context of an empty window: zeros (D,); int16 for int8 rows, to hold their sums.
 
-        With a pool rank above 1 (pool_rank, D), the largest sums in falling order. With EventNet's coding
-        (2, D), magnitudes and time bins; int32 for rows of integers.
+        With a pool rank above 1 it is (pool_rank, D), the largest sums in descending order. With EventNet's
+        coding it is (2, D), magnitudes and time bins, and int32 for integer rows.
         """
         dtype = self.features.dtype
         if self.phase is not None:
@@ -116,10 +116,11 @@ class EncoderTable:
         return np.zeros(shape, np.int16 if dtype == np.int8 else dtype)
 
     def update(self, context: np.ndarray, events: Any, start_us: int, window_us: int) -> np.ndarray:
-        """Return context after more events of the same window; `context`, as of `empty`, is left as it was.
+        """Return the context after more events of the same window; `context` (see `empty`) is not changed.
 
         Raises:
-            ValueError: As `models.encoder.event_batch.index_events`, or `context` is not one of this table's.
+            ValueError: As in `models.encoder.event_batch.index_events`, or `context` has not the shape and
+                dtype of this table's contexts.
         """
         own = self.empty()
         if context.shape != own.shape or context.dtype != own.dtype:
@@ -132,7 +133,7 @@ class EncoderTable:
         return result
 
     def _raise(self, batch: EventBatch, contexts: np.ndarray) -> None:
-        """Raise each of `contexts` (B, ...) to the maximum over it and its window's events."""
+        """Raise each of `contexts` (B, ...) to the maximum of itself and its window's events."""
         kernel = _raise_to if self.phase is None else _raise_to_newest
         given = self.features, self.embedding, batch.code, batch.bin, batch.offsets, contexts
         if self.pool_rank == 1:
@@ -141,7 +142,7 @@ class EncoderTable:
             _raise_ranks(*given, (0,) * self.pool_rank)
 
     def latent(self, context: np.ndarray) -> np.ndarray:
-        """Return latent mu (latent,) of a context."""
+        """Return the latent mu (latent,) of a context."""
         return self._latents(context[None])[0]
 
     def _latents(self, contexts: np.ndarray) -> np.ndarray:
@@ -154,7 +155,7 @@ class EncoderTable:
         return _mlp(values, *self.hidden, *self.head)
 
     def encode(self, events: Any, start_us: int, window_us: int) -> np.ndarray:
-        """Return latent mu (latent,) of one window; without events, that of the zero context.
+        """Return the latent mu (latent,) of one window; without events, the latent of the zero context.
 
         Args:
             events: Structured array with integer fields t [us], x, y [pixels], p (-1 or +1).
@@ -162,15 +163,15 @@ class EncoderTable:
             window_us: Length of the window [us].
 
         Raises:
-            ValueError: As `models.encoder.event_batch.index_events`.
+            ValueError: As in `models.encoder.event_batch.index_events`.
         """
         return self.encode_batch(batch_windows([(events, start_us, window_us)], self.grid))[0]
 
     def encode_windows(self, windows: np.ndarray | Sequence[np.ndarray]) -> np.ndarray:
-        """Return latents (B, latent) of packed windows int32 (rows, 4) of any lengths; `encode`'s bytes.
+        """Return latents (B, latent) of packed windows int32 (rows, 4) of any lengths; same bits as `encode`.
 
         Raises:
-            ValueError: As `models.encoder.event_batch.batch_packed`.
+            ValueError: As in `models.encoder.event_batch.batch_packed`.
         """
         return self.encode_batch(batch_packed(windows, self.grid))
 
@@ -183,10 +184,10 @@ class EncoderTable:
 
 
 def _exact(evae: EventVAE, time_bins: int | None) -> EventVAE:
-    """Return the model in float64 without its decoder, with another number of time bins unless None."""
+    """Return the model in float64 without its decoder, with `time_bins` time bins unless None."""
     settings = evae.settings
     exact = EventVAE.of(settings if time_bins is None else replace(settings, time_bins=time_bins))
-    del exact.decoder  # which nothing reads here, and which is large in float64
+    del exact.decoder  # not needed here, and large in float64
     exact = exact.double()
     exact.load_state_dict({k: v for k, v in evae.state_dict().items() if not k.startswith("decoder.")})
     return exact
@@ -195,7 +196,7 @@ def _exact(evae: EventVAE, time_bins: int | None) -> EventVAE:
 def _rounded(
     features: np.ndarray, embedding: np.ndarray, precision: str, dtype: str
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | float]:
-    """Return rows of features and embedding in their precision, and what one unit of theirs is worth."""
+    """Return the rows of features and embedding in this precision, and the value of one unit."""
     if precision == "model":
         return features.astype(dtype), embedding.astype(dtype), 1.0
     highest = features.max(axis=0) + 1.0  # the embedding lies in [-1, 1]
@@ -220,9 +221,9 @@ def _read_only(array: np.ndarray, dtype: Any = None) -> np.ndarray:
 def _raise_to(features, embedding, code, bins, offsets, contexts) -> None:  # type: ignore[no-untyped-def]
     """Raise each row of `contexts` (B, D) to the maximum over its window's events.
 
-    Four events at a time, so that the context is read and written a quarter as often; the
-    last four may hold an event several times, which changes no maximum. Each sum keeps the type of the
-    context, which numba would widen to int64: a vector register then holds as many as there are.
+    Processes four events at a time, so that the context is read and written a quarter as often; the
+    last four may repeat an event, which changes no maximum. Each sum is cast to the type of the context,
+    because numba would widen integers to int64, and fewer would fit into a vector register.
     """
     cells, unit = len(features), contexts.dtype.type
     for b in range(len(contexts)):
@@ -241,7 +242,7 @@ def _raise_to(features, embedding, code, bins, offsets, contexts) -> None:  # ty
 
 @numba.njit(cache=True, error_model="numpy")
 def _raise_ranks(features, embedding, code, bins, offsets, contexts, levels) -> None:  # type: ignore[no-untyped-def]
-    """`_raise_to` for the largest sums, one of each level: contexts (B, levels, D), in falling order."""
+    """Run `_raise_to` for the largest sums: contexts (B, levels, D), in descending order of the levels."""
     cells, size = len(features), features.shape[1]
     none = np.zeros(size, features.dtype)
     blocks = np.zeros(((size + BLOCK - 1) // BLOCK, len(levels), BLOCK), contexts.dtype)
@@ -266,7 +267,7 @@ def _raise_ranks(features, embedding, code, bins, offsets, contexts, levels) -> 
 def _sort_in(blocks, levels, event_1, event_2, event_3, event_4) -> None:  # type: ignore[no-untyped-def]
     """Sort four events (row, code) into the largest sums (blocks, levels, BLOCK).
 
-    The number of levels is part of their tuple's type, so that the loop over them is unrolled, and a block's
+    The number of levels is part of the tuple's type, so the loop over levels is unrolled and a block's
     largest sums stay in registers. A row of zeros with a code of zeros changes nothing.
     """
     unit = blocks.dtype.type
@@ -289,7 +290,7 @@ def _sort_in(blocks, levels, event_1, event_2, event_3, event_4) -> None:  # typ
 
 @numba.njit(cache=True, error_model="numpy")
 def _raise_to_newest(features, embedding, code, bins, offsets, contexts) -> None:  # type: ignore[no-untyped-def]
-    """Raise magnitudes and their time bins `contexts` (B, 2, D); of equal magnitudes the newest stays."""
+    """Raise magnitudes and their time bins in `contexts` (B, 2, D); the newest event wins a tie."""
     cells, unit = len(features), contexts.dtype.type
     for b in range(len(contexts)):
         best, newest = contexts[b]
@@ -304,18 +305,18 @@ def _raise_to_newest(features, embedding, code, bins, offsets, contexts) -> None
 
 @numba.njit(cache=True, error_model="numpy")
 def _mlp(contexts, hidden_weight, hidden_bias, weight, bias):  # type: ignore[no-untyped-def]
-    """Return second half of the encoder: ReLU layer, then mu, (B, latent) of contexts (B, K)."""
+    """Compute the second half of the encoder: ReLU layer, then mu (B, latent), from contexts (B, K)."""
     hidden = dense(contexts, hidden_weight, hidden_bias)
     return dense(np.maximum(hidden, np.float32(0.0)), weight, bias)
 
 
-# Reordering the sums lets them use vector registers (20 times faster); it decides no event.
+# Reordered sums can use vector registers (20 times faster). Which event wins does not depend on them.
 @numba.njit(cache=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
 def dense(inputs, weight, bias):  # type: ignore[no-untyped-def]
     """Return the products inputs (B, K) @ weight (M, K).T + bias (M,).
 
-    Two rows of either at a time, so that a number is loaded half as often. An odd last one comes twice:
-    so its sums are added in the same order in any batch, which BLAS does not promise.
+    Processes two rows of each matrix at a time, so that each number is loaded half as often. An odd last row
+    is processed twice, so that its sums have the same order in any batch, which BLAS does not guarantee.
     """
     outputs = np.empty((len(inputs), len(bias)), bias.dtype)
     for i in range(0, len(bias), 2):

@@ -27,15 +27,15 @@ from models.kinds import EvaeSettings, checked, renamed
 FORMAT = 1
 MAX_MANIFEST_BYTES = 1 << 20
 MAX_HEADER_BYTES = 1 << 20
-DECODER = "decoder."  # of the names of its tensors
-LEAN = {torch.float32: torch.float16}  # what a tensor may be rounded to
+DECODER = "decoder."  # prefix of the names of its tensors
+LEAN = {torch.float32: torch.float16}  # dtype that a lean file may round a tensor to
 RESERVED = ("format", "model", "sha256")
-CHECKSUM = "checksum"  # of a manifest's other values; manifests of older versions have none
-ADDED_SETTINGS = {"coding": "additive", "pool_rank": 1, "octaves": 0}  # of files without these keys
+CHECKSUM = "checksum"  # key of the checksum of a manifest's other values; older manifests have none
+ADDED_SETTINGS = {"coding": "additive", "pool_rank": 1, "octaves": 0}  # for files without these keys
 
 
 class EncoderManifest(TypedDict, total=False):
-    """What an encoder's manifest holds; the first three keys always."""
+    """Keys of an encoder's manifest; the first three are required."""
 
     format: int
     model: EvaeSettings
@@ -46,7 +46,7 @@ class EncoderManifest(TypedDict, total=False):
 
 
 class EncoderFileError(ValueError):
-    """An encoder file that was refused; the message begins with its name."""
+    """An encoder file is invalid; the message begins with its name."""
 
 
 class DamagedManifestError(Exception):
@@ -59,15 +59,15 @@ def save_encoder(
     """Write an encoder and its manifest; each file appears complete or not at all.
 
     Args:
-        path: The tensors' file, ending in .safetensors; the manifest takes the same name and .json.
+        path: The tensors' file, ending in .safetensors; the manifest has the same name with .json.
         evae: float32 model.
-        manifest: What else to record, as JSON values: sensor settings, hash, metrics.
-        lean: Leave the decoder out and round the weights to float16: it encodes, but reconstructs
-            nothing, in a fraction of the space.
+        manifest: Other values to record, as JSON: sensor settings, hash, metrics.
+        lean: Leave out the decoder and round the weights to float16: a fraction of the size, but the
+            model can only encode, not reconstruct.
 
     Raises:
-        EncoderFileError: A tensor is not finite or not float32, or the manifest holds a
-            reserved key, a value that JSON cannot hold, or is too large.
+        EncoderFileError: A tensor is not finite or not float32, or the manifest is too large or
+            contains a reserved key or a value that JSON cannot represent.
     """
     target = tensor_path(path)
     taken = [key for key in RESERVED if key in manifest]
@@ -161,17 +161,17 @@ def read_manifest(path: Path) -> EncoderManifest:
 
 
 def with_checksum(manifest: Mapping[str, object]) -> dict[str, object]:
-    """Return a manifest, and the checksum of its values as JSON holds them."""
+    """Return a copy of a manifest with the checksum of its JSON values added."""
     text = json.dumps(manifest, allow_nan=False)
     canonical = json.dumps(json.loads(text), sort_keys=True, separators=(",", ":"))
     return {**manifest, CHECKSUM: hashlib.sha256(canonical.encode()).hexdigest()[:12]}
 
 
 def without_checksum(manifest: Any) -> Any:
-    """Return a manifest without its checksum; one that has none as it is.
+    """Check a manifest's checksum and return the manifest without it; unchanged if it has none.
 
     Raises:
-        DamagedManifestError: Its values are not those that the checksum was made of.
+        DamagedManifestError: The values do not match the checksum.
     """
     if not isinstance(manifest, dict) or CHECKSUM not in manifest:
         return manifest
@@ -182,16 +182,16 @@ def without_checksum(manifest: Any) -> Any:
 
 
 def expected_tensors(settings: EvaeSettings) -> dict[str, Tensor]:
-    """Return state of a model with these settings: shapes and dtypes, without memory for values."""
+    """Return the state of a model with these settings: shapes and dtypes, without memory for values."""
     with torch.device("meta"):
         return EventVAE.of(settings).state_dict()
 
 
 def check_tensors(path: Path, tensors: dict[str, Tensor], settings: EvaeSettings) -> None:
-    """Compare tensors with the model they belong to.
+    """Check tensors against the model they belong to.
 
     Raises:
-        EncoderFileError: Another set of names, another shape or dtype, or a value that is not finite.
+        EncoderFileError: A name, shape or dtype differs, a value is not finite, or a variance is negative.
     """
     expected = expected_tensors(settings)
     if is_lean(tensors):
@@ -214,7 +214,7 @@ def tensor_path(path: str | Path) -> Path:
     """Return the tensors' file as a Path.
 
     Raises:
-        EncoderFileError: It does not end in .safetensors.
+        EncoderFileError: The path does not end in .safetensors.
     """
     target = Path(path)
     if target.suffix != ".safetensors":
@@ -226,8 +226,8 @@ def read_limited(path: Path, limit: int) -> bytes:
     """Return the bytes of a file of at most `limit` bytes.
 
     Raises:
-        EncoderFileError: It cannot be read, is a link, a pipe or a device, or is larger; that is
-            known before a byte is read.
+        EncoderFileError: The file cannot be read, is a link, a pipe or a device, or is larger. All
+            of this is checked before a byte is read.
     """
     try:
         handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)  # a pipe would block

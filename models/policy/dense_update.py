@@ -1,9 +1,9 @@
 """PPO's gradient steps for a policy of two dense tanh networks, all of an update in one compiled call.
 
-At a minibatch of 32 the arithmetic of such networks takes tens of microseconds, and dispatching its
-tensor operations and their gradients ten times as long. The loss, the clipped gradient and Adam are
-those of RLlib's PPO in torch, which serves all other networks and which the tests compare this
-with; sums run in another order, and a tanh errs by at most 4e-7 of its value.
+At a minibatch of 32 the arithmetic of such networks takes tens of microseconds, and dispatching torch's
+operations and their gradients ten times as long. The loss, gradient clipping and Adam are the same as in
+RLlib's PPO in torch, which trains all other networks and is the reference in the tests. Sums run in
+another order, and the relative error of tanh is at most 4e-7.
 """
 
 import math
@@ -20,7 +20,7 @@ from models.encoder.products import add_product, add_rows, aligned, dot, fma
 
 compiled = numba.njit(cache=True, error_model="numpy", nogil=True)
 F32 = np.float32
-TANH_IS_ONE = F32(7.9053111)  # in float32, from here on
+TANH_IS_ONE = F32(7.9053111)  # tanh is 1 in float32 from here on
 # tanh(x) = x P(x^2) / Q(x^2), highest power first: the rational approximation of the library Eigen.
 P6, P5, P4 = F32(-2.76076847742355e-16), F32(2.00018790482477e-13), F32(-8.60467152213735e-11)
 P3, P2, P1 = F32(5.12229709037114e-08), F32(1.48572235717979e-05), F32(6.37261928875436e-04)
@@ -29,7 +29,7 @@ P0, Q0 = F32(4.89352455891786e-03), F32(4.89352518554385e-03)
 
 
 class Figure(IntEnum):
-    """What is reported of a minibatch."""
+    """Metrics of a minibatch, as indices of their array."""
 
     POLICY_LOSS = 0
     VALUE_LOSS = 1
@@ -42,11 +42,11 @@ NUM_FIGURES = len(Figure)
 
 
 class Rows(NamedTuple):
-    """The steps of an iteration, each an array (N, ...); float32 but for the actions, int64.
+    """The N steps of an iteration as arrays (N, ...); actions are int64, all others float32.
 
     Attributes:
-        stacks: What both networks read.
-        privileged: What the value network alone reads behind it, of any width, also none.
+        stacks: Inputs of both networks.
+        privileged: Further inputs of the value network alone, after the stacks; any width, also 0.
     """
 
     stacks: np.ndarray
@@ -73,14 +73,14 @@ class Settings(NamedTuple):
 
 
 class Network(NamedTuple):
-    """One network, flat: its parameters lie as `torch.nn.utils.parameters_to_vector` puts them.
+    """One network as flat arrays, in the order of `torch.nn.utils.parameters_to_vector`.
 
     Attributes:
-        widths: Of its inputs and of each layer's outputs, int64.
+        widths: Numbers of inputs and of each layer's outputs, int64.
         values: The parameters.
-        gradient: Of them.
-        outputs: Those of all layers, one after the other.
-        of_outputs: Their gradients.
+        gradient: Gradient of the parameters.
+        outputs: Outputs of all layers, one layer after the other.
+        of_outputs: Gradients of the outputs.
     """
 
     widths: np.ndarray
@@ -91,7 +91,7 @@ class Network(NamedTuple):
 
 
 class Adam(NamedTuple):
-    """The parameters of both networks, their gradient, and its moments, one array each."""
+    """The parameters of both networks, their gradient, and Adam's two moments, one array each."""
 
     values: np.ndarray
     gradient: np.ndarray
@@ -109,18 +109,18 @@ def update_dense(
     """Take all gradient steps of an iteration; parameters and optimiser change in place.
 
     Args:
-        networks: The policy's and the value's, as `models.policy.networks.mlp` builds them.
-        optimizer: Of the parameters of both, in this order.
-        rows: What to learn from.
+        networks: The policy and the value network, as built by `models.policy.networks.mlp`.
+        optimizer: Optimiser of the parameters of both networks, in this order.
+        rows: Steps to learn from.
         orders: int64 (epochs, N), the order of the rows in each epoch.
-        settings: Of loss and optimiser.
+        settings: Settings of loss and optimiser.
 
     Returns:
-        Means over the minibatches of the last epoch, float64, each at its `Figure`; the norm is that of the
-        gradient before the clip.
+        Means over the minibatches of the last epoch, float64, indexed by `Figure`; the norm is that of the
+        gradient before clipping.
 
     Raises:
-        RuntimeError: A gradient is not finite; the weights are those before it.
+        RuntimeError: A gradient is not finite; the weights are those before this gradient's step.
     """
     parameters = [value for network in networks for value in network.parameters()]
     states = [_adam_state(optimizer, value) for value in parameters]
@@ -143,7 +143,7 @@ def update_dense(
 
 
 def _adam_state(optimizer: torch.optim.Adam, value: torch.Tensor) -> dict[str, Any]:
-    """Return Adam's state of one parameter; of its first step, as torch begins it."""
+    """Return Adam's state of one parameter; before the first step, initialise it as torch does."""
     state = optimizer.state[value]
     if not state:
         state["step"] = torch.zeros(())
@@ -152,7 +152,7 @@ def _adam_state(optimizer: torch.optim.Adam, value: torch.Tensor) -> dict[str, A
 
 
 def _flat(networks: Sequence[nn.Sequential], adam: Adam, most: int) -> list[Network]:
-    """Return the arrays of each network, with room for the outputs of minibatches of up to `most` rows."""
+    """Return the arrays of each network, with space for the outputs of minibatches of up to `most` rows."""
     made, begin = [], 0
     for network in networks:
         layers = [layer for layer in network if isinstance(layer, nn.Linear)]
@@ -166,7 +166,7 @@ def _flat(networks: Sequence[nn.Sequential], adam: Adam, most: int) -> list[Netw
 
 @compiled
 def _take_steps(pi, vf, adam, rows, orders, settings, taken):  # type: ignore[no-untyped-def]
-    """Return `update_dense`'s figures, the norm NaN if one was not finite, and Adam's steps so far."""
+    """Return the metrics (norm NaN if a gradient was not finite) and the number of Adam's steps so far."""
     epochs, count = orders.shape
     size = min(settings.minibatch_size, count)
     seen, more = rows.stacks.shape[1], rows.privileged.shape[1]
@@ -202,13 +202,13 @@ def _take_steps(pi, vf, adam, rows, orders, settings, taken):  # type: ignore[no
 
 @compiled
 def _part(flat, begin, rows, columns):  # type: ignore[no-untyped-def]
-    """Return a matrix that begins at a place of an array."""
+    """Return a view of a flat array from index `begin` on, as a matrix (rows, columns)."""
     return flat[begin : begin + rows * columns].reshape((rows, columns))
 
 
 @compiled
 def _forward(inputs, network):  # type: ignore[no-untyped-def]
-    """Fill the outputs of all layers; return the last one's, and the place of their gradient."""
+    """Fill the outputs of all layers; return the last layer's outputs and the array for their gradient."""
     widths, count = network.widths, len(inputs)
     shown, at, to = inputs, 0, 0
     for k in range(1, len(widths)):
@@ -229,7 +229,7 @@ def _forward(inputs, network):  # type: ignore[no-untyped-def]
 
 @compiled
 def tanh(values):  # type: ignore[no-untyped-def]
-    """Replace each of `values` (N,), float32, by its tanh."""
+    """Replace `values`, float32 (N,), by their tanh."""
     for j in range(len(values)):
         x = values[j]
         x = -TANH_IS_ONE if x < -TANH_IS_ONE else x  # NaN stays
@@ -278,7 +278,7 @@ def _add_losses(  # type: ignore[no-untyped-def]
 
 @compiled
 def _backward(inputs, network):  # type: ignore[no-untyped-def]
-    """Fill the gradient of all parameters from that of the last layer's outputs."""
+    """Compute the gradient of all parameters from the gradient of the last layer's outputs."""
     widths, count = network.widths, len(inputs)
     at, to = len(network.values), count * widths[1:].sum()
     for k in range(len(widths) - 1, 0, -1):

@@ -11,12 +11,13 @@ from core.neighbour_filter import passing, quiet_sensor
 
 @dataclass(frozen=True)
 class EventFilter:
-    """What a filter remembers of one episode.
+    """A neighbour filter and its state within one episode.
 
     Attributes:
         support: Neighbours needed, 1 to 8.
-        tau_us: How long ago they may have fired, at most [us].
-        last_us: When each pixel fired last, int64 (height + 2, width + 2) with a rim; changed by each call.
+        tau_us: Maximum age of a neighbour's last event [us].
+        last_us: Time of each pixel's last event, int64 (height + 2, width + 2) with a rim; updated by each
+            call.
     """
 
     support: int
@@ -25,14 +26,15 @@ class EventFilter:
 
     @classmethod
     def begin(cls, support: int, tau_us: int, width: int, height: int) -> "EventFilter":
-        """Return the filter of an episode without events yet, on a sensor of so many pixels."""
+        """Return the filter at the start of an episode, for a sensor of width x height pixels."""
         return cls(support, tau_us, quiet_sensor(width, height))
 
     def __call__(self, events: Any) -> dict[str, np.ndarray]:
         """Return the events that pass, in their order.
 
         Args:
-            events: Integer arrays t [us], x, y, p by name, in time order, not before those of the last call.
+            events: Integer arrays t [us], x, y, p by name, in time order, not earlier than the last call's
+                events.
 
         Raises:
             ValueError: An event lies outside the sensor.
@@ -50,7 +52,7 @@ class EventFilter:
 
 
 def filter_of(sensor: Mapping[str, Any], width: int, height: int) -> EventFilter | None:
-    """Return the filter of a policy's sensor settings, as a manifest holds them; None without one."""
+    """Return the filter that a manifest's sensor settings define; None if they define none."""
     if not sensor.get("filter_support"):
         return None
     return EventFilter.begin(int(sensor["filter_support"]), int(sensor["filter_tau_us"]), width, height)

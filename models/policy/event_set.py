@@ -1,15 +1,15 @@
 """A small network over a set of events, trained end to end: the rival of a frozen encoder.
 
-In the spirit of FLEET (Gottwald et al.): Fourier features of a pixel's place, time as a gate on
-what an event says, and pooling over the set. A window is thinned to at most `EVENTS` events,
-evenly over their order in time; of fewer, the rest of the rows is empty (`event_batch.event_rows`).
+Similar to FLEET (Gottwald et al.): Fourier features of a pixel's position, a gate that depends on
+time, and pooling over the set. A window is thinned to at most `EVENTS` events, spread evenly over
+their order in time; unused rows are empty (`event_batch.event_rows`).
 
     window = [ max | mean | number ] over events of  place(x, y, p) * gate(t)
 
 `EventSet.plain` is this formula, row by row. `EventSet.forward` is the same function with the
 same parameters and gradients, several times faster on a CPU: both factors run once per distinct
-value in the batch, and the products are pooled as they are made. `EventTables` is the function of
-weights that no longer change: both factors are tabulated once. Only the order of sums differs.
+value in the batch, and the products are pooled as they are computed. `EventTables` is the same
+function for fixed weights: both factors are tabulated once. Only the order of sums differs.
 """
 
 import math
@@ -25,18 +25,18 @@ from models.encoder.event_batch import ROW_EMPTY, ROW_OFF, ROW_ON, EventBatch, G
 from models.encoder.products import Linear
 from models.encoder.table import dense
 
-EVENTS = 256  # of a window that the network sees
-TIMES = 1024  # steps into which a window's time is rounded
-OCTAVES = 5  # of the Fourier features: waves of 2 images down to 1/8 of one
+EVENTS = 256  # most events of a window that the network sees
+TIMES = 1024  # time steps of a window
+OCTAVES = 5  # octaves of the Fourier features: wavelengths from 2 images down to 1/8 of one
 WIDTH = 64  # features of an event
-OUTPUTS = 128  # of the trunk
+OUTPUTS = 128  # outputs of the trunk
 
 
 class EventSet(nn.Module):
-    """Features of sets of events: float32 (B, OUTPUTS) of stacks int16 (B, stack, EVENTS, 4)."""
+    """Map stacks of sets of events, int16 (B, stack, EVENTS, 4), to features float32 (B, OUTPUTS)."""
 
     def __init__(self, stack: int, size: Sequence[int]) -> None:
-        """Make it for stacks of `stack` windows of a sensor of `size` (width, height) pixels."""
+        """Build the network for stacks of `stack` windows and a sensor of `size` (width, height) pixels."""
         super().__init__()
         self.grid = Grid(size[0], size[1], TIMES)
         self.place = nn.Sequential(Linear(4 * OCTAVES + 3, WIDTH), nn.ReLU(), Linear(WIDTH, WIDTH), nn.ReLU())
@@ -46,10 +46,10 @@ class EventSet(nn.Module):
     def forward(self, stacks: Tensor) -> Tensor:
         """Pool each event's features times its gate: maximum, mean and number over each window.
 
-        The fused form on a CPU, the plain one elsewhere.
+        Uses the fused form on a CPU, `plain` elsewhere.
 
         Raises:
-            ValueError: A row is no event of the sensor; on a CPU.
+            ValueError: A row is not an event of the sensor (checked on a CPU only).
         """
         if stacks.device.type != "cpu":
             return self.plain(stacks)
@@ -59,7 +59,7 @@ class EventSet(nn.Module):
         return self._joined((largest, total, number), stacks.shape[:2])
 
     def plain(self, stacks: Tensor) -> Tensor:
-        """Compute the features row by row: on a GPU, in exported files, and to test the fused form."""
+        """Compute the features row by row: for GPUs, exported files, and tests of the fused form."""
         kind, time, x, y = stacks.to(self.gate[0].weight)[..., None].unbind(-2)
         on = (kind == ROW_ON).to(kind) - (kind == ROW_OFF).to(kind)
         there = (kind != ROW_EMPTY).to(kind)
@@ -69,20 +69,20 @@ class EventSet(nn.Module):
         return self._joined(pooled, stacks.shape[:2])
 
     def _pooled(self, batch: EventBatch) -> tuple[Tensor, Tensor]:
-        """Return maximum and sum (windows, WIDTH) of the events of each window."""
+        """Return maximum and sum (windows, WIDTH) over the events of each window."""
         cells, _, cell = distinct(batch.code)
         times, _, time = distinct(batch.bin)
         return GatedPool.apply(*self.factors(cells, times), Events(cell, time, batch.offsets))
 
     def factors(self, cells: np.ndarray, times: np.ndarray) -> tuple[Tensor, Tensor]:
-        """Return what the features of events are the products of.
+        """Return the two factors whose product is the features of an event.
 
         Args:
-            cells: int (P,), as `EventBatch.code`.
-            times: int (T,), as `EventBatch.bin`.
+            cells: int (P,), values of `EventBatch.code`.
+            times: int (T,), values of `EventBatch.bin`.
 
         Returns:
-            (P, WIDTH) of the cells, and (T, WIDTH) of the times.
+            The factor (P, WIDTH) of the cells, and the factor (T, WIDTH) of the times.
         """
         weight, (width, height, _) = self.gate[0].weight, self.grid
         sides = [along(torch.arange(side).to(weight)[:, None], side) for side in (width, height)]
@@ -92,29 +92,29 @@ class EventSet(nn.Module):
         return self.place(torch.cat(places, dim=-1)), gates
 
     def _joined(self, pooled: tuple[Tensor, Tensor, Tensor], shape: Sequence[int]) -> Tensor:
-        """Return the trunk's outputs (B, OUTPUTS) of maxima, sums and numbers of all windows."""
+        """Return the trunk's outputs (B, OUTPUTS) from maxima, sums and numbers of all windows."""
         largest, total, number = (part.reshape(*shape, -1) for part in pooled)
         mean = total / number.clamp_min(1.0)
         return self.join(torch.cat([largest, mean, number / EVENTS], dim=-1).flatten(1))
 
 
 def along(place: Tensor, side: int) -> Tensor:
-    """Return Fourier features (..., 1 + 2 OCTAVES) of places (..., 1) along a side of so many pixels."""
+    """Return Fourier features (..., 1 + 2 OCTAVES) of positions (..., 1) along a side of `side` pixels."""
     scaled = place * (2.0 / max(side - 1, 1)) - 1.0
-    # Each factor is a Python number: a tensor of them would be copied to a GPU, which cannot be recorded.
+    # The factors are Python numbers: a CUDA graph cannot record the copy of a tensor of factors to the GPU.
     turns = torch.cat([scaled * (math.pi * 2.0 ** (octave - 1)) for octave in range(OCTAVES)], dim=-1)
     return torch.cat([scaled, turns.sin(), turns.cos()], dim=-1)
 
 
 def _inputs(x: Tensor, y: Tensor, on: Tensor) -> list[Tensor]:
-    """Return what `EventSet.place` sees of an event, from the features of its column and row."""
+    """Return the inputs of `EventSet.place`, from the Fourier features of an event's column and row."""
     parts = [1, OCTAVES, OCTAVES]
     (place_x, sin_x, cos_x), (place_y, sin_y, cos_y) = x.split(parts, -1), y.split(parts, -1)
     return [place_x, place_y, on, sin_x, sin_y, cos_x, cos_y]
 
 
 class Events(NamedTuple):
-    """Of each event its place among the cells and the times that occur; `offsets` as of `EventBatch`."""
+    """Index of each event's cell and time in `Factors`; `offsets` as in `EventBatch`."""
 
     cell: np.ndarray
     time: np.ndarray
@@ -122,14 +122,14 @@ class Events(NamedTuple):
 
 
 class Factors(NamedTuple):
-    """What the feature of an event is the product of: a row for each cell, and one for each time."""
+    """The two factors of the events' features: a row for each cell, and a row for each time."""
 
     places: np.ndarray
     gates: np.ndarray
 
 
 class EventTables:
-    """`EventSet` with the weights that it has now: faster, and with the same bytes in any batch."""
+    """`EventSet` with its current weights, tabulated: faster, and with the same bits in any batch."""
 
     def __init__(self, net: EventSet) -> None:
         """Compute the features of every cell and every time."""
@@ -143,7 +143,7 @@ class EventTables:
         """Return features (B, OUTPUTS) of stacks int16 (B, stack, EVENTS, 4).
 
         Raises:
-            ValueError: A row is no event of the sensor.
+            ValueError: A row is not an event of the sensor.
         """
         batch = batch_rows(stacks.reshape(-1, *stacks.shape[2:]), self._grid)
         largest, total = (np.zeros((len(batch), WIDTH), self._bias.dtype) for _ in range(2))
@@ -173,7 +173,7 @@ class GatedPool(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, of_largest: Tensor, of_total: Tensor) -> tuple[Tensor | None, ...]:
-        """Return the gradients of places and gates: of the sum by every event, of the maximum by winners."""
+        """Return the gradients of places and gates: every event counts in the sum, winners in the maximum."""
         factors = Factors(*(value.detach().numpy() for value in ctx.saved_tensors))
         found = Factors(*map(np.zeros_like, factors))
         gradients = of_largest.contiguous().numpy(), of_total.contiguous().numpy()

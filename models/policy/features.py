@@ -1,6 +1,6 @@
 """The features of a policy: what it keeps of one control step, an array of fixed size.
 
-Each `Feature` says its type and shape, and how it is computed from a batch of event windows or of pictures.
+Each `Feature` defines its type and shape, and how to compute it from a batch of event windows or pictures.
 `models.kinds.KINDS` names the feature of each kind of policy.
 """
 
@@ -18,7 +18,7 @@ from models.encoder.frozen import Encoder
 from models.kinds import PolicySpec
 from models.policy.event_set import EVENTS, TIMES
 
-Windows = np.ndarray | Sequence[np.ndarray]  # packed ones, of one length or of several
+Windows = np.ndarray | Sequence[np.ndarray]  # packed windows, of equal or different lengths
 
 
 class Step(NamedTuple):
@@ -26,8 +26,8 @@ class Step(NamedTuple):
 
     Attributes:
         events: Integer arrays t, x, y, p by name, such as an EVENT array, in time order.
-        start_us: Start of the step on the clock of the events.
-        window_us: Its length.
+        start_us: Start of the step on the clock of the events [us].
+        window_us: Length of the step [us].
     """
 
     events: Any
@@ -36,15 +36,15 @@ class Step(NamedTuple):
 
 
 class Feature(NamedTuple):
-    """How a feature is computed.
+    """The definition of a feature.
 
     Attributes:
-        dtype: Of its array.
-        shape: The policy -> its shape.
+        dtype: Type of its array.
+        shape: policy -> shape of the array.
         from_observations: (B observations, policy, encoder) -> features (B, ...) of that shape.
         from_events: (step, policy, encoder) -> feature; None: it cannot be computed from events.
 
-    The encoder is that of a policy with a frozen one, else None. `of_windows` makes both functions of one.
+    `encoder` is the policy's frozen encoder, or None. `of_windows` derives both functions from one.
     """
 
     dtype: type
@@ -59,11 +59,11 @@ def of_windows(
     compute: Callable[[EventBatch, PolicySpec, Any], np.ndarray],
     grid: Callable[[PolicySpec, Any], Grid] = lambda spec, encoder: Grid(spec.width, spec.height, 1),
 ) -> Feature:
-    """Return the feature that one function computes from event windows, in training and from events alike.
+    """Return a feature that one function computes from event windows, in training and from raw events.
 
     Args:
-        dtype: As of `Feature`.
-        shape: As of `Feature`.
+        dtype: See `Feature`.
+        shape: See `Feature`.
         compute: (batch of B windows, policy, encoder) -> features (B, ...).
         grid: (policy, encoder) -> sensor size and time bins of the batch.
     """
@@ -106,7 +106,7 @@ def column_counts(batch: EventBatch, bands: Sequence[int] = ()) -> np.ndarray:
 
     Args:
         batch: B windows.
-        bands: As of `models.kinds.ColumnsModel`; events in other rows are not counted.
+        bands: See `models.kinds.ColumnsModel`; events in other rows are not counted.
 
     Returns:
         float32 (B, 2 * bands * width).
@@ -114,7 +114,7 @@ def column_counts(batch: EventBatch, bands: Sequence[int] = ()) -> np.ndarray:
     width, height, _ = batch.grid
     edges = bands or (0, height)
     count, below = len(edges) - 1, batch.code < width * height
-    band = np.searchsorted(edges, np.arange(height), side="right") - 1  # of each row; -1 or `count`: of none
+    band = np.searchsorted(edges, np.arange(height), side="right") - 1  # of each row; -1 or `count`: none
     band = band[batch.code // width % height]
     place = ((2 * batch.window + below) * count + band) * width + batch.code % width
     place = place[(band >= 0) & (band < count)]
@@ -123,10 +123,10 @@ def column_counts(batch: EventBatch, bands: Sequence[int] = ()) -> np.ndarray:
 
 
 def event_picture(code: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Return 255 where a pixel's last event was ON, 125 where OFF, else 0: uint8 (H, W).
+    """Draw an event image: 255 where a pixel's last event was ON, 125 where OFF, else 0; uint8 (H, W).
 
-    The rule of `envs.events.event_image` (appendix D.1.2); `code` of events in time order, as in
-    `models.encoder.event_batch.EventBatch`.
+    The rule is the same as in `envs.events.event_image` (appendix D.1.2). `code` holds the events in time
+    order, as in `models.encoder.event_batch.EventBatch`.
     """
     picture = np.zeros(width * height, np.uint8)
     draw_last(code, picture, GREY_ON, GREY_OFF)
@@ -146,7 +146,7 @@ def _grid_of_encoder(spec: PolicySpec, encoder: Encoder) -> Grid:
 
 
 def _thinned_rows(most: int) -> Callable[[EventBatch, PolicySpec, Any], np.ndarray]:
-    """Return the feature that keeps at most so many events of a window, as rows."""
+    """Return a function that computes rows of at most `most` events of each window."""
     return lambda batch, spec, encoder: event_rows(thin(batch, most), most)
 
 
@@ -155,7 +155,7 @@ def _picture_shape(spec: PolicySpec) -> tuple[int, ...]:
 
 
 def _pictures(observations: np.ndarray, spec: PolicySpec, dtype: type) -> np.ndarray:
-    """Return the observations without an axis for one channel, if they are pictures of this sensor."""
+    """Return the observations without a channel axis; raise ValueError unless they fit this sensor."""
     shape = _picture_shape(spec)
     if observations.dtype != dtype or observations.shape[1:] not in (shape, (*shape, 1)):
         rule = f"must be {np.dtype(dtype)} (B, {shape[0]}, {shape[1]}, 1), or without the 1"

@@ -1,7 +1,7 @@
-"""Read what callers give a policy: events and observations, as arrays, lists or tensors.
+"""Read the events and observations that callers pass to a policy, as arrays, lists or tensors.
 
-The meaning must be plain: events have names t, x, y, p or are rows of these four, in time order and within
-their control step. Everything else is refused by one rule.
+Events must have fields named t, x, y, p or be rows of these four, in time order and within their control
+step. Anything else raises an error that states `RULE`.
 """
 
 from collections.abc import Mapping
@@ -20,11 +20,11 @@ def read_fields(events: Any) -> dict[str, np.ndarray]:
     """Return t, x, y, p by name, integers (N,) each.
 
     Args:
-        events: A structured array, a mapping or a table with these names, or rows of them: arrays, lists or
-            tensors. Booleans of p are ON where true.
+        events: A structured array, a mapping or a table with these names, or rows of these four: arrays,
+            lists or tensors. If p is boolean, true is ON.
 
     Raises:
-        ValueError: It is none of these.
+        ValueError: The events have none of these forms.
     """
     is_named = isinstance(events, Mapping) or hasattr(events, "columns")  # a pandas table
     given: Any = events if is_named else _array(events)
@@ -50,11 +50,11 @@ def read_fields(events: Any) -> dict[str, np.ndarray]:
 
 
 def check_step(fields: Mapping[str, np.ndarray], start_us: int, window_us: int) -> None:
-    """Refuse events that are not those of a control step.
+    """Raise an error unless the events can belong to this control step.
 
     Raises:
-        ValueError: They are not in time order, lie outside [start_us, start_us + window_us], or have
-            another p than -1 and +1.
+        ValueError: Events are not in time order, lie outside [start_us, start_us + window_us], or have
+            a p other than -1 and +1.
     """
     t, p = fields["t"], fields["p"]
     if not len(t):
@@ -75,11 +75,11 @@ def check_step(fields: Mapping[str, np.ndarray], start_us: int, window_us: int) 
 
 
 def read_observations(observations: Any, dtype: type) -> Any:
-    """Return observations as arrays: one of all, or one of each episode if their lengths differ.
+    """Return observations as one array, or as a list of one array per episode if the lengths differ.
 
     Args:
-        observations: Arrays and tensors keep their type.
-        dtype: Of lists of numbers that it can represent.
+        observations: One observation per episode. Arrays and tensors keep their type.
+        dtype: Type for lists of numbers, if it can represent them.
     """
     if isinstance(observations, np.ndarray | torch.Tensor):
         return _array(observations)
@@ -98,7 +98,7 @@ def _typed(values: Any, dtype: type) -> np.ndarray:
 
 
 def _array(values: Any) -> np.ndarray:
-    """Return an array; that of a ragged list has no dimension and is refused later."""
+    """Return an array; a ragged list becomes an array without dimensions, which later checks reject."""
     if isinstance(values, torch.Tensor):
         return values.detach().cpu().numpy()
     try:
@@ -108,7 +108,7 @@ def _array(values: Any) -> np.ndarray:
 
 
 def _columns(rows: np.ndarray) -> list[np.ndarray]:
-    """Return the four columns of rows."""
+    """Return the four columns of event rows (N, 4)."""
     if rows.size == 0 and rows.shape in ((0,), (0, 4)):
         return [np.empty(0, np.int64)] * 4
     if rows.dtype.names or rows.ndim != 2 or rows.shape[1] != len(NAMES):

@@ -1,12 +1,12 @@
 """What a policy keeps of the past: its last features, or means of them that decay with time.
 
-Kept features are an array (B, depth, ...), the newest last. A stack holds the last ones, whatever time lies
-between them. Decaying means, one for each time constant, say how long something has been so, whatever the
-rate of control: a feature holds until the next one, so that m <- f + (m - f) exp(-dt / tau).
+Stored features are an array (B, depth, ...), the newest last. A stack holds the last features, regardless of
+the time between them. Decaying means, one for each time constant, encode duration independently of the
+control rate: a feature is constant until the next one, so that m <- f + (m - f) exp(-dt / tau).
 
-A policy with `own_actions` appends to each feature which action it took last, as a one among zeros. The
-decaying means then say what a vehicle with inertia or a delay is about to do, without a sensor for it.
-One with `own_velocity` appends the velocity that the vehicle measures.
+A policy with `own_actions` appends its last action to each feature (one-hot). The decaying means then show
+what a vehicle with inertia or a delay is about to do, without a sensor for it. A policy with `own_velocity`
+appends the velocity that the vehicle measures.
 """
 
 import numpy as np
@@ -14,18 +14,18 @@ import numpy as np
 from models.kinds import PolicySpec
 from models.policy.features import Feature, Windows, feature_of, push_features
 
-VELOCITY_UNIT_MPS = 10.0  # what a network reads as 1, so that velocities are about as large as other features
+VELOCITY_UNIT_MPS = 10.0  # a network reads it as 1, so that velocities are about as large as other features
 
 
 def kept_shape(spec: PolicySpec, feature: Feature | None = None) -> tuple[int, ...]:
-    """Return what is kept of an episode, which the networks read: (depth, *feature).
+    """Return the shape of an episode's stored features, which the networks read: (depth, *feature).
 
     Args:
         spec: The policy.
-        feature: What is kept of a step; None: what its row says, as in training.
+        feature: The feature of a step; None: the one in the policy's row of `KINDS`, as in training.
 
     Raises:
-        ValueError: `own_actions` or `own_velocity` of a policy whose feature is not a vector of floats.
+        ValueError: The policy has `own_actions` or `own_velocity`, but its feature is not a vector of floats.
     """
     feature = feature or feature_of(spec)
     shape = feature.shape(spec)
@@ -47,27 +47,27 @@ def remember(
     taken: np.ndarray,
     velocity_mps: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Add the newest feature of each episode to what was kept; the first of an episode fills all of it.
+    """Add each episode's newest feature to its stored features; an episode's first feature fills them all.
 
     Args:
-        kept: (B, depth, ...) of `kept_shape`.
+        kept: Stored features (B, depth, ...), see `kept_shape`.
         features: (B, ...) of the same type.
         first: bool (B,), True where the feature is the first of an episode.
         spec: The policy.
-        window_us: How long each feature took, (B,) or one for all [us]; a stack does not ask.
-        taken: The action of each episode's last step, int (B,); only a policy with `own_actions` asks.
-        velocity_mps: What each vehicle measures now, to the right and ahead, (B, 2) [m/s]; only a policy with
-            `own_velocity` asks.
+        window_us: Duration of each feature's step, (B,) or one for all [us]; not used by a stack.
+        taken: The action of each episode's last step, int (B,); used only with `own_actions`.
+        velocity_mps: Velocity that each vehicle measures now, to the right and ahead, (B, 2) [m/s]; used only
+            with `own_velocity`.
 
     Returns:
         (B, depth, ...), a new array.
 
     Raises:
-        ValueError: A velocity is asked for, and is missing or not finite.
+        ValueError: The policy has `own_velocity`, and the velocity is missing or not finite.
     """
     if spec.own_actions:
         known = np.zeros((len(features), spec.num_actions), features.dtype)
-        known[np.arange(len(features)), taken] = ~first  # an episode begins without an action
+        known[np.arange(len(features)), taken] = ~first  # no action precedes an episode
         features = np.concatenate([features, known], axis=1)
     if spec.own_velocity:
         if velocity_mps is None or not np.isfinite(velocity_mps).all():
@@ -88,5 +88,5 @@ def remember(
 
 
 def windows_us(observations: Windows, spec: PolicySpec) -> np.ndarray | int:
-    """Return how long the packed window of each observation is [us]; 0 for a policy that does not ask."""
+    """Return the length of each observation's packed window [us]; 0 for a policy that does not use it."""
     return np.array([window[0, 2] for window in observations]) if spec.memory_ms else 0

@@ -1,6 +1,6 @@
-"""What a policy would see if left and right were exchanged: a second sample of each step.
+"""Exchange left and right in a policy's observations, for a second training sample of each step.
 
-The world's sun stands to the right, so a mirrored sample shows it to the left, where it never stands.
+The sun of the world is always on the right, so a mirrored sample shows it on the left, where it never is.
 """
 
 from collections.abc import Callable
@@ -15,14 +15,14 @@ def mirror(observations: Any, spec: PolicySpec) -> Any:
     """Return observations with left and right exchanged.
 
     Args:
-        observations: B packed windows, of one length or of several, or pictures (B, H, W) or (B, H, W, 1).
-        spec: The policy, whose kind says which.
+        observations: B packed windows, of equal or different lengths, or pictures (B, H, W) or (B, H, W, 1).
+        spec: The policy; its kind determines the type of observation.
 
     Returns:
-        The same container and types, copies.
+        Copies in the same container and types.
 
     Raises:
-        ValueError: The kind's observation has no mirror image known here.
+        ValueError: There is no function in `MIRRORS` for the kind's observation.
     """
     name = spec.kind.observation
     if name not in MIRRORS:

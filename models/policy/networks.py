@@ -27,7 +27,7 @@ from models.policy.event_set import OUTPUTS, EventSet, EventTables
 from models.policy.memory import kept_shape
 
 PARTS = ("trunk", "pi", "vf")
-# Of the last layer's weights; all other layers have sqrt(2) (stable-baselines' policies).
+# Gain of the last layer's initial weights; all other layers have sqrt(2) (stable-baselines' policies).
 LAST_GAIN = {"pi": 0.01, "vf": 1.0}
 CNN_OUTPUTS = 512
 Run = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
@@ -53,22 +53,22 @@ def initialise(networks: nn.ModuleDict, seed: int) -> nn.ModuleDict:
 
 
 def by_dense_layers(trunk: nn.Module, pi: nn.Module) -> Run:
-    """Run dense networks without torch, with the same bytes in any batch.
+    """Return a function that runs dense networks without torch, with the same bits in any batch.
 
-    Torch's calls take ten times as long as the arithmetic of a few rows.
+    For a few rows torch's calls take ten times as long as the arithmetic.
     """
     logits_of = _dense_layers(cast(nn.Sequential, pi))
     return lambda stacks, state: (logits_of(stacks), state)
 
 
 def by_event_tables(trunk: nn.Module, pi: nn.Module) -> Run:
-    """Run an event set without torch, with the same bytes in any batch."""
+    """Return a function that runs an event set without torch, with the same bits in any batch."""
     features, decide = EventTables(cast(EventSet, trunk)), _dense_layers(nn.Sequential(pi))
     return lambda stacks, state: (decide(features(stacks)), state)
 
 
 def by_torch(trunk: nn.Module, pi: nn.Module) -> Run:
-    """Run a network that has no faster form; its dense layers by the weights of this moment."""
+    """Return a function that runs a network by torch, with the current weights of dense layers packed."""
     trunk, pi = packed(trunk), packed(pi)
 
     def run(stacks: np.ndarray, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -79,7 +79,7 @@ def by_torch(trunk: nn.Module, pi: nn.Module) -> Run:
 
 
 def _dense_layers(network: nn.Sequential) -> Callable[[np.ndarray], np.ndarray]:
-    """Return what computes the outputs of dense layers with tanh between them, float32 (B, outputs)."""
+    """Return a function that computes dense layers with tanh between them, float32 (B, outputs)."""
     linear = [layer for layer in network if isinstance(layer, nn.Linear)]
     first, *layers = [
         [value.detach().numpy().copy() for value in (layer.weight, layer.bias)] for layer in linear
@@ -100,15 +100,15 @@ def _no_state(spec: PolicySpec) -> int:
 
 
 class Network(NamedTuple):
-    """How the networks of a kind of policy are built, run and trained.
+    """Functions that build and run the networks of a kind of policy, and the way to train them.
 
     Attributes:
         build: (shape of the stack of features, policy) -> the parts `PARTS`.
-        run: (trunk, pi) -> the policy by the weights of this moment, a function from stacks (B, depth, ...)
+        run: (trunk, pi) -> the policy with its current weights, a function from stacks (B, depth, ...)
             and states (B, S) to logits float32 (B, actions) and the next states.
-        gradients: What computes PPO's gradients. "compiled": `models.policy.dense_update`, for dense
-            networks without a trunk alone; "torch"; "gpu": torch, on a GPU if the learner has one.
-        state: The policy -> numbers S of a recurrent network's state; 0: it has none.
+        gradients: Code that computes PPO's gradients. "compiled": `models.policy.dense_update`, only for
+            dense networks without a trunk; "torch"; "gpu": torch, on a GPU if the learner has one.
+        state: policy -> size S of a recurrent network's state; 0: not recurrent.
     """
 
     build: Callable[[Sequence[int], PolicySpec], tuple[nn.Module, ...]]
@@ -118,16 +118,16 @@ class Network(NamedTuple):
 
 
 def network_of(spec: PolicySpec) -> Network:
-    """Return the network of a policy; a plug-in's plain function is built, and run by torch."""
+    """Return the network of a policy. A plug-in may give a plain build function, which torch then runs."""
     named = resolve(spec.kind.network)
     return named if isinstance(named, Network) else Network(named)
 
 
 def assemble(spec: PolicySpec) -> nn.ModuleDict:
-    """Return the parts of a policy's networks (`PARTS`), to be initialised or loaded.
+    """Build the parts of a policy's networks (`PARTS`); the caller initialises or loads the weights.
 
     Raises:
-        ValueError: The row of the network says that it is compiled, but it has other layers than `mlp`.
+        ValueError: The network has "compiled" gradients, but not the layers of `mlp`.
     """
     shape, network = kept_shape(spec), network_of(spec)
     parts = dict(zip(PARTS, network.build(shape, spec), strict=True))
@@ -154,7 +154,7 @@ def mlp(inputs: int, hidden: Sequence[int], outputs: int) -> nn.Sequential:
 
 
 def is_mlp(network: nn.Module) -> bool:
-    """Whether `mlp` could have built it: what is compiled for such networks would compute others wrong."""
+    """Whether `mlp` could have built this network; compiled gradients would be wrong for any other one."""
     layers = list(network) if isinstance(network, nn.Sequential) else []
     kinds = [(nn.Tanh,) if place % 2 else (nn.Linear, Linear) for place in range(len(layers))]
     biased = all(layer.bias is not None for layer in layers[::2] if isinstance(layer, nn.Linear))
@@ -162,7 +162,7 @@ def is_mlp(network: nn.Module) -> bool:
 
 
 def widened(network: nn.Module, inputs: int) -> nn.Module:
-    """Return a copy whose first layer has more inputs, of weight 0; fewer if `inputs` is negative."""
+    """Return a copy whose first layer has `inputs` more inputs of weight 0, or fewer if negative."""
     wider = copy.deepcopy(network)
     first = next(layer for layer in wider.modules() if isinstance(layer, nn.Linear))
     first.weight = nn.Parameter(nn.functional.pad(first.weight.detach(), (0, inputs)))
@@ -171,29 +171,29 @@ def widened(network: nn.Module, inputs: int) -> nn.Module:
 
 
 def nature_cnn(shape: Sequence[int], spec: PolicySpec) -> tuple[nn.Module, ...]:
-    """Return convolutions that policy and value share, over the stacked pictures as channels.
+    """Return convolutions shared by policy and value, with the stacked pictures as channels.
 
-    They are those of `models.encoder.event_images.nature_layers`, as in stable-baselines' CnnPolicy, which
-    appendix D.1.2 names. Pictures need `models.kinds.MIN_IMAGE` pixels each way.
+    The layers are `models.encoder.event_images.nature_layers`, as in stable-baselines' CnnPolicy, which
+    appendix D.1.2 names. Pictures need at least `models.kinds.MIN_IMAGE` pixels each way.
     """
     trunk = nn.Sequential(Bytes(), *nature_layers(shape, CNN_OUTPUTS))
     return trunk, Linear(CNN_OUTPUTS, spec.num_actions), Linear(CNN_OUTPUTS, 1)
 
 
 def event_set(shape: Sequence[int], spec: PolicySpec) -> tuple[nn.Module, ...]:
-    """Return a network over sets of events that policy and value share (`models.policy.event_set`)."""
+    """Return a network over sets of events, shared by policy and value (`models.policy.event_set`)."""
     trunk = EventSet(shape[0], (spec.width, spec.height))
     return trunk, Linear(OUTPUTS, spec.num_actions), Linear(OUTPUTS, 1)
 
 
 def finetuned_mlps(shape: Sequence[int], spec: PolicySpec) -> tuple[nn.Module, ...]:
-    """Return the networks of `two_mlps` behind an encoder that they share and that PPO trains on."""
+    """Return the networks of `two_mlps` after a shared encoder that PPO fine-tunes."""
     _, pi, vf = two_mlps((shape[0], spec.evae.latent), spec)
     return FinetunedEncoder(spec.evae), pi, vf
 
 
 class Bytes(nn.Module):
-    """Bytes to numbers in [0, 1]; here, so that pictures travel and are stored as bytes."""
+    """Scale bytes to [0, 1]; part of the network, so that pictures are sent and stored as bytes."""
 
     def forward(self, pictures: Tensor) -> Tensor:
         """Scale uint8 (...) to float32 (...)."""

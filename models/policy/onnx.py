@@ -5,26 +5,26 @@ For robots without Python. The graph is the whole policy, with the preprocessing
     events       int64 (N, 4), t since the window's start [us], x, y [pixels], p (-1 or +1), in time order
     window_us    int64 (), length of the window [us]        (policies that see events)
     luminance    float32 (H, W), linear                     (policies that see luminance)
-    last_stack   (depth, ...), next_stack of the step before; for an episode's first step anything
-    velocity_mps float32 (2,), as the vehicle measures it  (policies with own_velocity; behind first)
-    last_action  int64 (), the action taken in the step before  (policies with own_actions; behind first)
-    last_state   float32 (S,), next_state of the step before  (recurrent networks; behind first)
+    last_stack   (depth, ...), next_stack of the step before; any values at an episode's first step
+    velocity_mps float32 (2,), as the vehicle measures it  (policies with own_velocity; after first)
+    last_action  int64 (), the action taken in the step before  (policies with own_actions; after first)
+    last_state   float32 (S,), next_state of the step before  (recurrent networks; after first)
     first        bool (), whether this is an episode's first step
     last_us      int64 (H + 2, W + 2), next_us of the step before  (policies with a neighbour filter)
 
-and gives::
+and returns::
 
     logits       float32 (actions,), unnormalised log-probabilities
     next_stack   as last_stack: float32, uint8 for pictures, int32 for sets of events
-    next_action  int64 (), the likeliest; give another one as last_action if it was taken
+    next_action  int64 (), the most likely; if another one was taken, pass that as last_action
     next_state   as last_state
-    next_us      as last_us: when each pixel fired last, since the end of this step [us]
-    dropped      int64 (), events or pixels that were left out because `Policy` refuses them
-    command      float32 (C,), of the likeliest action, as the vehicle's Box takes it  (vehicles with a body)
+    next_us      as last_us: when each pixel fired last, relative to the end of this step [us]
+    dropped      int64 (), events or pixels that were ignored because `Policy` rejects them
+    command      float32 (C,), of the most likely action, as in the vehicle's Box  (vehicles with a body)
 
-The file leaves out events outside of the image or the window or with another p than -1 and +1, every event if
-they are not in time order or window_us is not in 1 .. MAX_WINDOW_US, and takes pixels that are not finite for
-black.
+The graph ignores events outside the image or the window, or with p other than -1 and +1. It ignores all
+events if they are not in time order or window_us is not in 1 .. MAX_WINDOW_US. Pixels that are not finite
+count as black.
 
 `tests/models/policy/test_onnx.py` compares the file with `models.policy.Policy` in onnxruntime. The extra
 `onnx` of this package is needed.
@@ -55,10 +55,10 @@ MAX_EVENTS = 1 << 24
 
 
 def export_onnx(policy: Policy, path: str | Path) -> Path:
-    """Write a policy as an ONNX file; its weights are in it.
+    """Write a policy as an ONNX file, including its weights.
 
     Args:
-        policy: As `models.policy.load_policy` returns it.
+        policy: From `models.policy.load_policy`.
         path: The file; its folder must exist.
 
     Returns:
@@ -112,7 +112,7 @@ class PolicyGraph(nn.Module):
         spec = policy.spec
         self.shape = policy.stack_shape
         kept = torch.from_numpy(np.empty(0, policy.feature.dtype)).dtype
-        self.dtype = torch.int32 if kept == torch.int16 else kept  # of which onnxruntime knows more
+        self.dtype = torch.int32 if kept == torch.int16 else kept  # onnxruntime has more operators for int32
         self.size, self.bands = (spec.height, spec.width), torch.tensor(spec.bands)
         self.tau_us = torch.tensor([1e3 * time_ms for time_ms in spec.memory_ms])
         self.filter = filter_of(policy.manifest.get("sensor", {}), spec.width, spec.height)
@@ -140,7 +140,7 @@ class PolicyGraph(nn.Module):
                 self.register_buffer(name, torch.from_numpy(array.copy()))
 
     def examples(self) -> tuple[list[str], tuple[Tensor, ...], tuple[object, ...]]:
-        """Return names, examples and free sizes of what the policy sees."""
+        """Return names, examples and dynamic shapes of the inputs that the policy observes."""
         if self.sees_events:
             events = torch.tensor([[0, 0, 0, 1], [1, 0, 0, -1], [2, 0, 0, 1]])
             count = torch.export.Dim("count", min=0, max=MAX_EVENTS)
@@ -148,7 +148,7 @@ class PolicyGraph(nn.Module):
         return ["luminance"], (torch.zeros(self.size),), (None,)
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
-        """Return the outputs that the module's docstring lists, of the inputs that it lists."""
+        """Compute the outputs from the inputs; the module's docstring lists both."""
         outputs = self._decided(*inputs)
         return outputs if self.commands is None else (*outputs, self.commands[outputs[0].argmax()])
 
@@ -162,7 +162,7 @@ class PolicyGraph(nn.Module):
         return *self._step(events[passing], window_us, stack, first, *state), next_us - window_us, dropped
 
     def _valid(self, *inputs: Tensor) -> tuple[tuple[Tensor, ...], Tensor]:
-        """Return the inputs without what `Policy` refuses, and how much that was."""
+        """Return the inputs without events or pixels that `Policy` rejects, and the number of these."""
         if not self.sees_events:
             luminance, *rest = inputs
             finite = torch.isfinite(luminance)
@@ -178,7 +178,7 @@ class PolicyGraph(nn.Module):
         return (events[inside], window_us.clamp(1, MAX_WINDOW_US), *rest), (~inside).sum()
 
     def _step(self, *inputs: Tensor) -> tuple[Tensor, ...]:
-        """Return the logits, the next stack and, of a recurrent network, its next state."""
+        """Return logits, next stack, the next action with `own_actions`, and a recurrent network's state."""
         *given, state = inputs if self.state_size else (*inputs, torch.zeros(0))
         *given, action = given if self.own_actions else (*given, torch.tensor(0))
         *given, velocity_mps = given if self.own_velocity else (*given, torch.zeros(2))
@@ -202,14 +202,14 @@ class PolicyGraph(nn.Module):
         return logits, stack, *((logits.argmax(), *own) if self.own_actions else own)
 
     def _rest(self, events: Tensor, window_us: Tensor) -> Tensor:
-        """Return share (K, 1) of each mean that outlives the step (`models.policy.memory`)."""
+        """Return the factor (K, 1) by which each mean decays in this step (`models.policy.memory`)."""
         return torch.exp(-window_us.float() / self.tau_us)[:, None]
 
 
 def _filtered(chosen: EventFilter, events: Tensor, last_us: Tensor) -> tuple[Tensor, Tensor]:
-    """Return which events pass (`models.policy.event_filter`), bool (N,), and each pixel's last time.
+    """Return which events pass (`models.policy.event_filter`), bool (N,), and each pixel's last event time.
 
-    Every event is compared with all others: exact, and quick for up to some thousand.
+    Compares every event with all others: exact, and fast for up to a few thousand events.
     """
     t, x, y, _ = events.unbind(1)
     width = chosen.last_us.shape[1]
@@ -244,14 +244,14 @@ def table_latent(policy: PolicyGraph, events: Tensor, window_us: Tensor) -> Tens
 
 
 def picture_latent(policy: PolicyGraph, events: Tensor, window_us: Tensor) -> Tensor:
-    """Return mean of the latent of the event image, with OFF as a share of ON."""
+    """Return the mean of the latent of the event image, in which ON is 1 and OFF is `OFF_SHARE`."""
     picture = event_image(policy, events, window_us)
     shares = torch.where(picture == GREY_ON, 1.0, torch.where(picture == GREY_OFF, OFF_SHARE, 0.0))
     return policy.layers(shares[None, None])[0, : policy.latent]
 
 
 def event_set(policy: PolicyGraph, events: Tensor, window_us: Tensor) -> Tensor:
-    """Return rows of events, as `models.encoder.event_batch.event_rows`."""
+    """Return rows of events, as in `models.encoder.event_batch.event_rows`."""
     events, there = _thinned(events, EVENTS)
     t, x, y, p = events.unbind(1)
     rows = torch.stack([torch.where(p > 0, ROW_ON, ROW_OFF), _bins(t, window_us, TIMES), x, y], dim=1)
@@ -259,7 +259,7 @@ def event_set(policy: PolicyGraph, events: Tensor, window_us: Tensor) -> Tensor:
 
 
 def _thinned(events: Tensor, most: int) -> tuple[Tensor, Tensor]:
-    """Return at most so many events, evenly over their order (`event_batch.thin`), and which are any."""
+    """Return `most` rows of events, evenly over their order (`event_batch.thin`), and which are filled."""
     count = torch.ones_like(events[:, 0]).sum()
     kept = count.clamp(max=most)
     k = torch.arange(most)
@@ -269,7 +269,7 @@ def _thinned(events: Tensor, most: int) -> tuple[Tensor, Tensor]:
 
 
 def _bins(t: Tensor, window_us: Tensor, time_bins: int) -> Tensor:
-    """Return time bin of each event (`models.encoder.embedding.time_bin`)."""
+    """Return the time bin of each event (`models.encoder.embedding.time_bin`)."""
     offset = torch.minimum(t.clamp(min=0), window_us)
     return torch.div(offset * time_bins, window_us, rounding_mode="floor").clamp(max=time_bins - 1)
 
@@ -285,7 +285,7 @@ def columns(policy: PolicyGraph, events: Tensor, window_us: Tensor) -> Tensor:
 
 
 def event_image(policy: PolicyGraph, events: Tensor, window_us: Tensor) -> Tensor:
-    """Return 255 or 125 by each pixel's last event, the one with the highest number."""
+    """Return 255 or 125 by each pixel's last event (the one with the highest number), else 0."""
     _, x, y, p = events.unbind(1)
     numbered = 2 * torch.ones_like(p).cumsum(0) + (p > 0)
     none = torch.zeros(policy.size[0] * policy.size[1], dtype=torch.int64)
@@ -294,11 +294,11 @@ def event_image(policy: PolicyGraph, events: Tensor, window_us: Tensor) -> Tenso
 
 
 def grey(policy: PolicyGraph, luminance: Tensor) -> Tensor:
-    """Return gamma-encoded 8-bit picture."""
+    """Return the gamma-encoded 8-bit picture."""
     return torch.round(255.0 * luminance.clamp(0.0, 1.0) ** (1.0 / GAMMA))
 
 
 def _code(policy: PolicyGraph, events: Tensor) -> Tensor:
-    """Return row of each event in a table: ((p > 0) * height + y) * width + x."""
+    """Return the row of each event in a table: ((p > 0) * height + y) * width + x."""
     _, x, y, p = events.unbind(1)
     return ((p > 0) * policy.size[0] + y) * policy.size[1] + x

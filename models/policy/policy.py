@@ -1,9 +1,9 @@
 """Policies and their folders: encoder, stack of the last features, networks.
 
-A policy folder turns observations, or events, into actions with the preprocessing of training,
-on a machine without Ray and without running anyone's code: safetensors files and their JSON
-manifests, each checked against its SHA-256 before use. A fine-tuned encoder is stored in the
-networks' file, and runs from a lookup table like a frozen one.
+A policy folder turns observations or events into actions with the preprocessing of training. It needs
+no Ray and contains no executable code: only safetensors files and their JSON manifests, each checked
+against its SHA-256 before use. A fine-tuned encoder is stored in the networks' file, and runs from a
+lookup table like a frozen one.
 """
 
 import dataclasses
@@ -45,22 +45,22 @@ MANIFEST, NETWORKS, ENCODER = "policy.json", "networks.safetensors", "encoder.sa
 ENCODER_FILES = (ENCODER, "encoder.json")
 REQUIRED = ("sha256", "name", "sensor", "sensor_hash")
 FORMAT = 2
-# Of a manifest's sensor settings: those that are the environment's own, and those of its simulation.
+# Keys of a manifest's sensor settings that belong to the environment, and to its simulation.
 ENV_FIELDS = ("control_hz", "speed_mps", "filter_support", "filter_tau_us", "vehicle", "body")
 FIDELITY_FIELDS = ("tolerance", "max_step_m", "samples", "cull_m")
 HEADINGS = ("forward", "left", "right")  # the actions of the kinematic vehicle
 REMEDY = "copy it again, or delete stages/train.json of its run folder and give the command again"
 OBSERVED = {"event_image": np.uint8, "luminance": np.float32}  # types of observations, else int32
 PREPARED = ("feature", "_network", "_run")  # attributes of a policy that are functions
-MAX_BYTES = 1 << 28  # of one file, which is read whole
+MAX_BYTES = 1 << 28  # limit of one file, which is read whole
 
 
 class PolicyFileError(ValueError):
-    """A policy folder that was refused; the message names the file and the reason."""
+    """A policy folder is invalid; the message names the file and the reason."""
 
 
 class PolicyManifest(TypedDict, total=False):
-    """What a policy's manifest holds beside the settings that `models.kinds.read_spec` reads."""
+    """Keys of a policy's manifest besides the settings that `models.kinds.read_spec` reads."""
 
     format: int
     sha256: dict[str, str]
@@ -79,19 +79,19 @@ class PolicyManifest(TypedDict, total=False):
 
 
 class Policy:
-    """Observations in, actions out; remembers the last features of each episode.
+    """Choose actions from observations or events; remember the last features of each episode.
 
     Attributes:
-        spec: What its networks were built from.
-        manifest: Sensor settings and hash, training settings and metrics; empty if it is from no folder.
-        encoder: Makes the latents that the networks read, frozen or fine-tuned; None without one.
-        deterministic: True: the most likely action; False: one drawn from the distribution.
-        commands: float64 (K, C), the command of each action of a vehicle with a body, as its Box takes it;
+        spec: Specification that its networks were built from.
+        manifest: Sensor settings and hash, training settings and metrics; empty if not loaded from a folder.
+        encoder: Computes the latents that the networks read, frozen or fine-tuned; None without an encoder.
+        deterministic: True: choose the most likely action; False: draw one from the distribution.
+        commands: float64 (K, C), the command of each action of a vehicle with a body, as in its Box;
             None for the kinematic vehicle's three headings.
         taken: int64 (B,), the action of each episode's last step, which a policy with `own_actions` sees: the
-            one that was chosen last, or the likeliest. Set it if another one was taken.
-        velocity_mps: float (B, 2), what each vehicle measures, to the right and ahead [m/s]; set it before
-            each step of a policy with `own_velocity`.
+            one chosen last or, after `logits` alone, the most likely. Set it if another one was taken.
+        velocity_mps: float (B, 2), velocity that each vehicle measures, to the right and ahead [m/s]; set it
+            before each step of a policy with `own_velocity`.
     """
 
     def __init__(
@@ -103,9 +103,9 @@ class Policy:
         rng: np.random.Generator | None = None,
         manifest: PolicyManifest | None = None,
     ) -> None:
-        """Join the networks, whose weights no longer change, and the encoder, if any.
+        """Combine networks, whose weights must no longer change, with the encoder, if any.
 
-        Actions are drawn by `rng`.
+        `rng` draws the actions if `deterministic` is False.
         """
         if not deterministic and rng is None:
             raise ValueError("rng must be given for a stochastic policy (deterministic=False), got None")
@@ -117,16 +117,16 @@ class Policy:
         self.reset()
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return all but functions, so that a policy is copied or pickled in mid-episode."""
+        """Return all attributes but functions, so that a policy can be copied or pickled in mid-episode."""
         return {name: value for name, value in self.__dict__.items() if name not in PREPARED}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Continue where a copy or a pickle was made."""
+        """Restore a copy or pickle; its episodes continue from the same state."""
         self.__dict__.update(state)
         self._prepare()
 
     def _prepare(self) -> None:
-        """Look up the feature and the network, and take the weights of this moment."""
+        """Look up the feature and the network, and prepare the network with its current weights."""
         tabulated = self.encoder is not None
         self.feature = LATENT if tabulated else feature_of(self.spec)
         self._network = TWO_MLPS if tabulated and self.spec.finetuned else network_of(self.spec)
@@ -134,14 +134,14 @@ class Policy:
 
     @property
     def observation(self) -> str:
-        """Return what the environment must show it: "window", "event_image" or "luminance"."""
+        """Return the observation that the policy needs: "window", "event_image" or "luminance"."""
         return self.spec.kind.observation
 
     @property
     def env_fields(self) -> dict[str, Any]:
-        """Return the fields of `envs.config.EnvConfig` that show the policy what it was trained to see.
+        """Return the fields of `envs.config.EnvConfig` that reproduce the observations of training.
 
-        `CorridorEnv(**policy.env_fields)` observes as in training, its neighbour filter included.
+        `CorridorEnv(**policy.env_fields)` observes as in training, including the neighbour filter.
         """
         sensor = dict(self.manifest.get("sensor", {}))
         own = {name: sensor.pop(name) for name in ENV_FIELDS if name in sensor}
@@ -152,7 +152,7 @@ class Policy:
 
     @property
     def stack_shape(self) -> tuple[int, ...]:
-        """Shape of what the networks read for one episode: (depth, *feature), the newest last."""
+        """Return the shape of the networks' input for one episode: (depth, *feature), the newest last."""
         return kept_shape(self.spec, self.feature)
 
     def reset(self, num_envs: int = 1) -> None:
@@ -174,10 +174,10 @@ class Policy:
         """Choose an action for each episode.
 
         Args:
-            observations: One per episode, as environments with `env_fields` show them, of the kind that
-                `observation` names: windows int32 (B, capacity + 1, 4), or a sequence of (count + 1, 4)
+            observations: One per episode, as environments with `env_fields` return them, of the kind
+                `observation`: windows int32 (B, capacity + 1, 4), or a sequence of (count + 1, 4)
                 of any lengths; event images uint8 or luminance float32, (B, H, W, 1) or (B, H, W).
-                Lists and tensors of them are read like arrays.
+                Lists and tensors are converted to arrays.
             restarted: bool (B,), True where the observation is the first of a new episode
                 (with Gymnasium's NEXT_STEP autoreset: where the step before was terminated
                 or truncated); None: nowhere.
@@ -189,14 +189,14 @@ class Policy:
 
     @property
     def action_names(self) -> tuple[str, ...]:
-        """Return a name for each action: of a heading, or of the numbers of its command."""
+        """Return a name for each action: its heading, or the numbers of its command."""
         return action_names(self.manifest)
 
     def act(self, events: Any, start_us: int, window_us: int) -> Any:
         """Choose the action of one episode from the events of its control step; see `event_logits`.
 
         Returns:
-            The number of the heading; for a vehicle with a body the command, float64 (C,).
+            The number of the heading; the command, float64 (C,), for a vehicle with a body.
         """
         action = int(self._choose(self.event_logits(events, start_us, window_us)[None])[0])
         return action if self.commands is None else self.commands[action].copy()
@@ -209,12 +209,12 @@ class Policy:
         Args:
             events: The events of the step in time order, t in (start_us, start_us + window_us]: integers
                 t, x, y, p by name, such as an EVENT array, or rows of these four; arrays, lists or tensors.
-                Booleans of p are ON where true.
+                If p is boolean, true is ON.
             start_us: Start of the step on the clock of the events [us].
             window_us: Length of the step [us].
 
         Raises:
-            ValueError: The policy does not see events, or these are not events of such a step.
+            ValueError: The policy does not see events, or the events do not belong to this step.
         """
         if self.feature.from_events is None:
             rule = f"this policy takes {self.observation} images, not events"
@@ -272,7 +272,7 @@ def _commands_of(manifest: PolicyManifest, spec: PolicySpec) -> np.ndarray | Non
     """Return the commands of a manifest.
 
     Raises:
-        PolicyFileError: They are not finite, or not one for each action.
+        PolicyFileError: The commands are not finite, or not one for each action.
     """
     if "commands" not in manifest:
         return None
@@ -295,22 +295,23 @@ def save_policy(
     encoder_metrics: Mapping[str, float] | None = None,
     lean: bool = False,
 ) -> Path:
-    """Write a policy folder that is complete in itself; its manifest comes last, and seals it.
+    """Write a self-contained policy folder. The manifest, with the SHA-256 of all files, is written last.
 
     Args:
-        path: Folder, made if missing.
-        networks: Those of `models.policy.networks.assemble`; with the value, for further training.
-        spec: What they were built from.
-        about: `sensor` and `sensor_hash`, and anything else that JSON holds, such as metrics.
+        path: Folder, created if missing.
+        networks: From `models.policy.networks.assemble`; with the value network, for further training.
+        spec: Specification that the networks were built from.
+        about: `sensor` and `sensor_hash`, and any other JSON values, such as metrics.
         evae: The frozen event VAE, for a policy that has one.
-        encoder_metrics: Its own held-out metrics, for the encoder's manifest.
-        lean: Weights in float16 and no decoder, a fraction of the size: it acts, but reconstructs nothing.
+        encoder_metrics: Held-out metrics of the event VAE, for the encoder's manifest.
+        lean: Round weights to float16 and leave out the decoder: a fraction of the size; the policy acts but
+            cannot reconstruct.
 
     Returns:
         The folder.
 
     Raises:
-        ValueError: An event VAE is missing or too many.
+        ValueError: The policy needs an event VAE and `evae` is None, or the other way round.
     """
     if spec.frozen != (evae is not None):
         rule = f"evae must be {'given' if spec.frozen else 'None'} for {spec.model.name}"
@@ -330,10 +331,10 @@ def save_policy(
 
 
 def save_lean_policy(source: str | Path, path: str | Path, about: Mapping[str, object]) -> Path:
-    """Write the policy of a folder once more, lean, with `about` added to its manifest; return the new one.
+    """Write a lean copy of a policy folder, with `about` added to its manifest; return the new folder.
 
     Raises:
-        PolicyFileError: As `load_policy`.
+        PolicyFileError: As in `load_policy`.
     """
     folder = Path(source)
     load_policy(folder)  # checks every file
@@ -348,10 +349,10 @@ def load_policy(
 ) -> Policy:
     """Read a policy folder and check it: format, SHA-256, shapes, finite weights.
 
-    Torch keeps its number of threads: call `torch.set_num_threads(1)` if other processes are busy.
+    The number of torch's threads is not changed: call `torch.set_num_threads(1)` if other processes are busy.
 
     Raises:
-        PolicyFileError: If the folder is not a whole, unchanged policy of this format.
+        PolicyFileError: The folder is not a complete, unchanged policy of this format.
     """
     folder = Path(path)
     manifest, spec = _read_manifest(folder / MANIFEST)
@@ -368,15 +369,15 @@ def load_policy(
 
 
 def _files(spec: PolicySpec) -> tuple[str, ...]:
-    """Return the files of a policy beside its manifest, which holds their SHA-256."""
+    """Return the names of a policy's files other than the manifest, which holds their SHA-256."""
     return (*(ENCODER_FILES if spec.frozen else ()), NETWORKS)
 
 
 def read_policy_manifest(file: Path) -> dict[str, Any]:
-    """Return the values of a policy's manifest as they were written; an empty one if they are no JSON object.
+    """Return a policy's manifest without its checksum; empty if the file holds no JSON object.
 
     Raises:
-        PolicyFileError: It is damaged.
+        PolicyFileError: The file cannot be read, is not JSON, or does not match its checksum.
     """
     try:
         read = without_checksum(json.loads(_read(file)))
@@ -418,9 +419,9 @@ def _tabulated(trunk: nn.Module, spec: PolicySpec) -> Encoder:
 
 
 def load_networks(file: Path, spec: PolicySpec) -> nn.ModuleDict:
-    """Return the networks of the file's tensors, which must fit one by one and be finite.
+    """Return the networks stored in a file; names, shapes and dtypes must match, values must be finite.
 
-    They are built without memory for their weights, so that wrong sizes in a manifest cost nothing.
+    The networks are built without memory for their weights, so that wrong sizes in a manifest cost nothing.
     """
     try:
         read = safetensors.torch.load(_read(file))

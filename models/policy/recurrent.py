@@ -2,8 +2,8 @@
 
     r, z = sigmoid(W x + U h),   n = tanh(W x + r * U h),   h <- n + z (h - n)
 
-The state h begins at zero with each episode. A sequence is computed step by step in the order in which a
-policy acts, so the logits of a sequence are those of its steps, apart from the order of sums in a batch.
+The state h is zero at the start of each episode. A sequence is computed step by step, in the order in which
+a policy acts, so its logits equal the logits of single steps, apart from the order of sums in a batch.
 """
 
 import math
@@ -22,7 +22,7 @@ class GatedUnit(nn.Module):
     """One GRU over the stacks of an episode's steps, flattened."""
 
     def __init__(self, inputs: int, units: int) -> None:
-        """Make it for so many inputs; its state has `units` numbers."""
+        """Build the unit for `inputs` inputs and a state of `units` numbers."""
         super().__init__()
         self.units = units
         self.inward = Linear(inputs, 3 * units)
@@ -45,7 +45,7 @@ class GatedUnit(nn.Module):
         return torch.stack(states, 1), state
 
     def after(self, given: Tensor, state: Tensor) -> Tensor:
-        """Return the state (B, units) after one step, of its weighted inputs (B, 3 units)."""
+        """Return the state (B, units) after one step, from its weighted inputs (B, 3 units)."""
         reset, update, new = given.split(self.units, 1)
         own_reset, own_update, own_new = self.inner(state).split(self.units, 1)
         news = torch.tanh(new + torch.sigmoid(reset + own_reset) * own_new)
@@ -59,12 +59,12 @@ def gru(shape: Sequence[int], spec: PolicySpec) -> tuple[nn.Module, ...]:
 
 
 def state_size(spec: PolicySpec) -> int:
-    """Return how many numbers the state has."""
+    """Return the size of the state."""
     return int(spec.model.units)  # type: ignore[attr-defined]
 
 
 def by_steps(trunk: nn.Module, pi: nn.Module) -> Run:
-    """Run a recurrent network for one step of each episode."""
+    """Return a function that runs a recurrent network for one step of each episode."""
 
     def run(stacks: np.ndarray, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         with torch.inference_mode():

@@ -1,7 +1,7 @@
 """A policy inside RLlib: a module that owns the networks and the encoder.
 
-`features` computes the features of a step (`models.policy.features`); the networks read stacks of the last
-ones, which the env runners keep. `models.policy.policy` is the same policy without Ray.
+`features` computes the features of a step (`models.policy.features`). The networks read stacks of the latest
+features, which the env runners store. `models.policy.policy` is the same policy without Ray.
 """
 
 import math
@@ -27,18 +27,18 @@ from models.policy.networks import PARTS, build_networks, network_of, widened
 from models.policy.policy import load_networks
 
 STATE = "h"  # RLlib's key of the one part of a recurrent state
-PRIVILEGED = "privileged"  # of a batch: what the value network alone is told, float32 (B, numbers)
+PRIVILEGED = "privileged"  # key of a batch: inputs of the value network alone, float32 (B, numbers)
 SEQUENCE = 32  # steps through which the gradient of a recurrent network flows
-VALUE_ROWS = 256  # of a whole batch at once: its activations then stay in the processor's cache
+VALUE_ROWS = 256  # rows of a batch computed together, so that activations stay in the CPU cache
 
 
 class EncoderFile(NamedTuple):
     """The file of a pretrained encoder.
 
     Attributes:
-        path: Of the tensors.
-        digest: Their SHA-256.
-        settings: Of the event VAE.
+        path: File of the tensors.
+        digest: SHA-256 of this file.
+        settings: Settings of the event VAE.
     """
 
     path: str
@@ -47,7 +47,7 @@ class EncoderFile(NamedTuple):
 
 
 def stack_space(spec: PolicySpec) -> gym.spaces.Box:
-    """Return what the networks read: (depth, *feature), as `models.policy.memory` keeps it."""
+    """Return the space of the networks' input: (depth, *feature), see `models.policy.memory`."""
     feature = feature_of(spec)
     whole = np.issubdtype(feature.dtype, np.integer)
     low, high = (np.iinfo(feature.dtype).min, np.iinfo(feature.dtype).max) if whole else (-np.inf, np.inf)
@@ -55,12 +55,12 @@ def stack_space(spec: PolicySpec) -> gym.spaces.Box:
 
 
 class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
-    """Frozen encoder, where the policy has one, and the networks.
+    """The networks of a policy, and its frozen encoder, if any, as an RLlib module.
 
-    The encoder's tensors are in every checkpoint and every weight sync, and in no optimiser: a
+    The encoder's tensors are in every checkpoint and every weight sync, but in no optimiser, so that a
     checkpoint is complete in itself. A fine-tuned encoder is the networks' trunk instead.
-    `model_config` holds what `module_spec` puts there. What is `PRIVILEGED` only widens the first layer of
-    the value network, and a policy that is exported is without it.
+    `module_spec` fills `model_config`. `PRIVILEGED` inputs only widen the first layer of the value network;
+    an exported policy does not have them.
     """
 
     def setup(self) -> None:
@@ -83,25 +83,25 @@ class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
         self._table: Encoder | None = None
 
     def get_non_inference_attributes(self) -> list[str]:
-        """Return what an env runner does without."""
+        """Return the parts that an env runner does not need."""
         return ["vf"]
 
     def train(self, mode: bool = True) -> "PolicyModule":
-        """Keep every part as it is: an encoder stays in eval mode, the other networks have no modes.
+        """Set the mode of this module alone: an encoder stays in eval mode, the other networks have no modes.
 
-        RLlib toggles the mode around every forward pass; a walk through all parts each
-        time would take longer than the pass, and would let running statistics move.
+        RLlib toggles the mode around every forward pass. Setting it in all parts each time would
+        take longer than the pass, and would let running statistics change.
         """
         self.training = mode
         return self
 
     def networks(self) -> nn.ModuleDict:
-        """Return the networks, named as in `networks.assemble`, without what is `PRIVILEGED`."""
+        """Return the networks, named as in `networks.assemble`, without `PRIVILEGED` inputs."""
         own = {**{name: getattr(self, name) for name in PARTS}, "vf": widened(self.vf, -self.privileged)}
         return nn.ModuleDict(own)
 
     def features(self, observations: Windows) -> np.ndarray:
-        """Return features (B, ...) of B observations, as those of `models.policy.policy.Policy`."""
+        """Return features (B, ...) of B observations, the same as in `models.policy.policy.Policy`."""
         if self.encoder is not None:
             self._table = self._table or tabulate(self.encoder, self.model_config["encoder_file"].settings)
         return self._features(observations)
@@ -118,10 +118,10 @@ class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
         velocity_mps: np.ndarray | None = None,
         mirrored: bool = False,
     ) -> np.ndarray:
-        """Return what the networks read after the newest observations (`models.policy.memory.remember`).
+        """Return the networks' input after the newest observations (`models.policy.memory.remember`).
 
-        With `mirrored` it reads the mirror image of the observations, while actions and velocities are
-        mirrored already. Call it without first.
+        With `mirrored` the observations are mirrored here, but the caller mirrors actions and velocities.
+        Call it without `mirrored` first, which builds the encoder's table.
         """
         features = (
             self._features(mirror(observations, self.spec)) if mirrored else self.features(observations)
@@ -130,7 +130,7 @@ class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
         return remember(kept, features, first, self.spec, duration_us, taken, velocity_mps)
 
     def set_state(self, state: Any) -> None:
-        """Load weights; the table is built again only if they change the encoder."""
+        """Load weights; discard the encoder's table only if the encoder changes."""
         if self.encoder is None:
             super().set_state(state)
             return
@@ -140,15 +140,15 @@ class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
             self._table = None
 
     def __getstate__(self) -> dict[str, object]:
-        """Return everything but the table, which is built from the encoder where it is needed."""
+        """Return everything but the table, which is rebuilt from the encoder when needed."""
         return {**self.__dict__, "_table": None}
 
     def get_initial_state(self) -> dict[str, Tensor]:
-        """Return the state at the start of an episode, as RLlib asks for it; empty unless recurrent."""
+        """Return the state at the start of an episode in RLlib's form; empty unless recurrent."""
         return {STATE: torch.zeros(self.state_size)} if self.state_size else {}
 
     def _embed(self, batch: dict[str, Any]) -> tuple[Tensor, dict[str, Any]]:
-        """Return the trunk's outputs, and the next state as RLlib wants it.
+        """Return the trunk's outputs, and the next state in RLlib's form.
 
         A recurrent network reads sequences (B, T, depth, ...), all others rows (B, depth, ...).
         """
@@ -162,15 +162,15 @@ class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
         return {Columns.ACTION_DIST_INPUTS: self.pi(embeddings), **state}
 
     def _forward_train(self, batch: dict[str, Any], **kwargs: object) -> dict[str, Any]:
-        """Return the trunk's outputs too, so that the loss of the value need not run the trunk again."""
+        """Return the trunk's outputs too, so that the value loss need not run the trunk again."""
         embeddings, state = self._embed(batch)
         return {Columns.ACTION_DIST_INPUTS: self.pi(embeddings), Columns.EMBEDDINGS: embeddings, **state}
 
     def compute_values(self, batch: dict[str, Any], embeddings: Tensor | None = None) -> Tensor:
-        """Return the values float32 (B,), or (B, T) of sequences, of observations and what is `PRIVILEGED`.
+        """Return the values float32 (B,), or (B, T) for sequences, of observations and `PRIVILEGED` inputs.
 
-        Without the trunk's embeddings no gradient is kept: RLlib asks so for the targets, of
-        the whole batch, whose graph would be a gigabyte of activations.
+        Without the trunk's embeddings no gradient is recorded: RLlib calls it this way for the
+        targets of the whole batch, whose graph would take a gigabyte of activations.
         """
         told = [batch[PRIVILEGED]] if self.privileged else []
         if embeddings is not None:
@@ -187,7 +187,7 @@ class PolicyModule(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
 
 
 def _begin(networks: nn.ModuleDict, file: Path, spec: PolicySpec) -> None:
-    """Load the weights of a policy's file; NaN if it is not there, which a checkpoint's own then replace."""
+    """Load initial weights from a policy's file; if it is missing, NaN, which a checkpoint then replaces."""
     if file.is_file():
         networks.load_state_dict(load_networks(file, spec).state_dict())
     else:
@@ -205,13 +205,13 @@ def module_spec(
     """Return RLlib's specification of the module.
 
     Args:
-        spec: What the networks are built from.
-        seed: Of the networks' initial weights.
-        encoder: The pretrained encoder's file and its manifest; None for a policy without one.
-        init: The file of networks to begin from instead.
-        privileged: Numbers that the value network alone is told of each step.
+        spec: Specification of the networks.
+        seed: Seed of the networks' initial weights.
+        encoder: The pretrained encoder's file and its manifest; None for a policy without an encoder.
+        init: File of networks whose weights replace the initial ones.
+        privileged: Number of inputs that only the value network gets in each step.
     """
-    # Only what is used: Tune continues a training only under the keys that it began with.
+    # Unused keys are left out: Tune resumes a run only with the same keys.
     added = {"init": str(init) if init else None, PRIVILEGED: privileged}
     file = None
     if encoder is not None:

@@ -1,4 +1,4 @@
-"""A trial of a policy's feature and network on a few observations, before anything is trained."""
+"""Try out a policy's feature and network on a few observations before training."""
 
 from typing import Any
 
@@ -14,10 +14,10 @@ EPISODES, EVENTS, WINDOW_US = 3, 200, 5_000
 
 
 def try_policy(spec: PolicySpec) -> None:
-    """Compute the feature, logits and values of a few random observations of a policy without an encoder.
+    """Compute feature, logits and values of a few random observations, for a policy without an encoder.
 
     Raises:
-        TrialError: A result has another shape or type than the row says, or is not finite.
+        TrialError: A result is not finite, or its shape or type differs from the row in `KINDS`.
         Exception: Whatever the feature or the network raises.
     """
     feature, seen = feature_of(spec), _observations(spec)

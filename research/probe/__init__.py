@@ -1,1 +1,1 @@
-"""What can be read from a representation by linear regression."""
+"""Measure what a regression can read from a representation of events."""

@@ -17,8 +17,8 @@ from models.encoder.event_images import cell_counts
 from models.encoder.frozen import encoder_of
 from models.policy.features import column_counts
 
-ALARM_M = 15.0  # an agent has to turn away from nearer obstacles
-CELLS = (8, 16)  # in each direction; the finer ones hold nearly all that a picture holds
+ALARM_M = 15.0  # an agent must avoid obstacles nearer than this
+CELLS = (8, 16)  # in each direction; the finer cells contain nearly all information of a picture
 
 
 @dataclass(frozen=True)
@@ -27,10 +27,10 @@ class ProbeData:
 
     Attributes:
         windows: Events of each step.
-        episode: int64 (N,), number of each step's episode, ascending.
-        proximity: float64 (N, SECTORS), of the nearest obstacle in each sector at the end of the step,
-            from left to right; see `envs.scene.range_scan.proximity`.
-        bearing_deg: float64 (SECTORS,), middle of each sector, to the right [degrees].
+        episode: Number of each step's episode, int64 (N,), ascending.
+        proximity: Proximity of the nearest obstacle in each sector at the end of the step, float64
+            (N, SECTORS), from left to right; see `envs.scene.range_scan.proximity`.
+        bearing_deg: Bearing of the middle of each sector, to the right [degrees], float64 (SECTORS,).
     """
 
     windows: list[Window]
@@ -40,19 +40,19 @@ class ProbeData:
 
     @property
     def alarm(self) -> np.ndarray:
-        """Bool (N,): whether an obstacle stands within ALARM_M."""
+        """Return whether an obstacle is within `ALARM_M` at each step, bool (N,)."""
         return self.proximity.max(axis=1) >= np.exp(-ALARM_M / NEAR_M)
 
 
 def record_probe_data(
     config: EnvConfig, num_steps: int, seed: int, advance: Callable[[int], None]
 ) -> ProbeData:
-    """Record random episodes as `jobs.training.collect` does, in other corridors, and the proximity.
+    """Record random episodes with proximity, as `jobs.training.collect` does but in other corridors.
 
     Args:
         config: Environment.
         num_steps: Control steps [-].
-        seed: Of corridors and actions.
+        seed: Seed of corridors and actions.
         advance: Called with the number of steps after each episode.
     """
     env = CorridorEnv(config)
@@ -60,7 +60,7 @@ def record_probe_data(
     windows: list[Window] = []
     episode: list[int] = []
     near: list[np.ndarray] = []
-    started = env.reset(seed=seed + SEED_STRIDE)  # not the corridors that the encoder was trained in
+    started = env.reset(seed=seed + SEED_STRIDE)  # not the corridors in which the encoder was trained
     while len(windows) < num_steps:
         start_us, number, done = 0, (episode[-1] + 1 if episode else 0), len(windows)
         agent.reset([env], [number])
@@ -77,33 +77,33 @@ def record_probe_data(
 
 
 def nothing(probe_data: ProbeData) -> np.ndarray:
-    """Zeros (N, 1): no information."""
+    """Return zeros (N, 1), which carry no information."""
     return np.zeros((len(probe_data.episode), 1), np.float32)
 
 
 def column_features(probe_data: ProbeData, grid: Grid) -> np.ndarray:
-    """The features of the policy event_columns at each step, float32 (N, 2 width)."""
+    """Return the features of the policy event_columns at each step, float32 (N, 2 width)."""
     return column_counts(batch_windows(probe_data.windows, grid))
 
 
 def cell_features(probe_data: ProbeData, grid: Grid, across: int) -> np.ndarray:
-    """log(1 + count) of OFF and ON events in `across` x `across` cells, float32 (N, 2 across^2)."""
+    """Return log(1 + count) of OFF and ON events in `across` x `across` cells, float32 (N, 2 across^2)."""
     return np.log1p(cell_counts(batch_windows(probe_data.windows, grid), across))
 
 
 def latents(probe_data: ProbeData, evae: EventVAE) -> np.ndarray:
-    """Latent of each step's window, float32 (N, latent)."""
+    """Return the latent of each step's window, float32 (N, latent)."""
     encoder = encoder_of(evae)
     return np.stack([encoder.encode(*window) for window in probe_data.windows])
 
 
 def stacked(features: np.ndarray, episode: np.ndarray, stack: int) -> np.ndarray:
-    """The last `stack` rows at each step, oldest first, as `models.policy.features.push_features` keeps them.
+    """Return the last `stack` rows at each step, oldest first, as in `models.policy.features.push_features`.
 
     Args:
         features: (N, D).
         episode: int64 (N,), ascending; the first row of an episode fills all places before it.
-        stack: Rows.
+        stack: Number of rows.
 
     Returns:
         (N, stack D).

@@ -1,9 +1,9 @@
 """What an agent can read from a representation of events: bearing and proximity of the obstacles ahead.
 
 Run: python -m platform.launch +exp=probe
-Expect: beyond the run's own encoder 32 short trainings, an hour on one core, and their probes, a
-quarter of an hour; the trainings are kept in the run folder, so that a killed job continues. One table
-and one plot, in the run folder under `probe/` and in MLflow.
+Expect: after the run's own encoder, 32 short trainings (an hour on one core) and their probes (a quarter
+of an hour). The trainings are stored in the run folder, so that a killed job resumes. One table and one
+plot, in the run folder under `probe/` and in MLflow.
 """
 
 import dataclasses
@@ -59,7 +59,7 @@ LEVEL_LOOKS = (
 
 @dataclass(frozen=True, config=STRICT)
 class Settings:
-    """On how many steps representations are probed, and which event VAEs are trained for it."""
+    """Settings of the probes: number of steps, and the event VAEs to train."""
 
     num_steps: Count
     num_validation_steps: Count
@@ -74,8 +74,8 @@ class Representation(NamedTuple):
     """A representation of events.
 
     Attributes:
-        name: As in the table.
-        represent: ProbeData -> float32 (N, D), one function per training.
+        name: Name in the table.
+        represent: Functions ProbeData -> float32 (N, D), one per training.
         place: Latent size and target of an event VAE trained here, or None.
     """
 
@@ -85,12 +85,12 @@ class Representation(NamedTuple):
 
 
 class ProbeResult(NamedTuple):
-    """How much one representation holds.
+    """The scores of one representation.
 
     Attributes:
-        representation: Which.
-        numbers: Numbers for each step [-].
-        scores: Of each number of steps that are read together.
+        representation: The representation.
+        numbers: Size of the representation of a step [-].
+        scores: Number of steps read together -> scores.
     """
 
     representation: Representation
@@ -152,7 +152,7 @@ def record_both(config: Config) -> tuple[ProbeData, ProbeData]:
 
 
 def representations(folder: Run, own: EventVAE) -> list[Representation]:
-    """The representations to compare; the event VAEs among them are trained, or read if they were before."""
+    """Return the representations to compare; train their event VAEs, or read those trained before."""
     grid, settings = own.grid, folder.config.own
     compared = [
         Representation("nothing", [nothing]),
@@ -171,7 +171,7 @@ def representations(folder: Run, own: EventVAE) -> list[Representation]:
 
 
 def trained(folder: Run, latent: int, target: str, seed: int) -> EventVAE:
-    """An event VAE of that latent size and target, trained briefly; the same seed gives the same windows."""
+    """Return a briefly trained event VAE of a latent size and target; equal seeds give equal windows."""
     config, iterations = folder.config, folder.config.own.iterations
     file = folder.path / "probe" / "encoders" / f"{target}-{latent}-s{seed}-{iterations}.safetensors"
     settings = trial_settings(config, {"latent": latent, "target": target})
@@ -201,14 +201,14 @@ def probe_representations(
 
 
 def headings(row: ProbeResult, shown: int) -> tuple[str, ...]:
-    """The headings of the table, which shows ridge and bearing for one number of steps."""
+    """Return the headings of the table, which shows ridge and bearing only for `shown` steps."""
     networks = [f"Network, {_steps(stack)}" for stack in row.scores]
     linear, bearing = f"Ridge, {_steps(shown)}", f"Bearing, {_steps(shown)} [deg]"
     return "Representation", "Numbers a step", linear, *networks, bearing
 
 
 def result_cells(row: ProbeResult, shown: int) -> tuple[str, ...]:
-    """A text for each of `headings`."""
+    """Return a text for each of `headings`."""
     networks = [_percent(part.network) for part in row.scores.values()]
     bearing, low, high = row.scores[shown].bearing_deg
     turned = f"{bearing:.1f} [{low:.1f}, {high:.1f}]"
@@ -216,7 +216,7 @@ def result_cells(row: ProbeResult, shown: int) -> tuple[str, ...]:
 
 
 def result_columns(rows: Sequence[ProbeResult]) -> dict[str, list[str | float]]:
-    """All scores as columns of a tracker's table; the first is unique."""
+    """Return all scores as columns of a tracker's table; the first column is unique."""
     pairs = [(row, stack) for row in rows for stack in row.scores]
     table: dict[str, list[str | float]] = {
         "representation": [f"{row.representation.name}, {_steps(stack)}" for row, stack in pairs],
@@ -229,12 +229,12 @@ def result_columns(rows: Sequence[ProbeResult]) -> dict[str, list[str | float]]:
 
 
 def key(row: ProbeResult) -> str:
-    """The name of a representation as a part of a metric's name."""
+    """Return the name of a representation as part of a metric's name."""
     return re.sub(r"[^a-z0-9]+", "_", row.representation.name.replace("'", ""))
 
 
 def plot_probes(rows: Sequence[ProbeResult]) -> Figure:
-    """Draw proximity read and error of the bearing against the latent size, a column per number of steps."""
+    """Draw proximity's score and the bearing's error over the latent size, a column per number of steps."""
     stacks = list(rows[0].scores)
     figure = Figure(figsize=(4.2 * len(stacks) + 0.8, 7.2), layout="constrained")
     grid = figure.subplots(2, len(stacks), squeeze=False, sharex=True, sharey="row")
@@ -251,7 +251,7 @@ def plot_probes(rows: Sequence[ProbeResult]) -> Figure:
 
 
 def _draw(panel: Axes, rows: Sequence[ProbeResult], values: Sequence[Interval]) -> None:
-    """Draw a line per target over the latent sizes, and a level per representation without training."""
+    """Draw a line per target over the latent sizes, and a level per representation not trained here."""
     pairs = list(zip(rows, values, strict=True))
     levels = [(row.representation.name, value) for row, value in pairs if row.representation.place is None]
     for (name, value), (colour, dashes) in zip(levels, LEVEL_LOOKS, strict=True):
@@ -265,7 +265,7 @@ def _draw(panel: Axes, rows: Sequence[ProbeResult], values: Sequence[Interval]) 
     for shift, target in enumerate(targets):
         sizes, points = zip(*((size, value) for size, own, value in placed if own == target), strict=True)
         middle, low, high = np.transpose(points)
-        x = np.array(sizes) * 1.04 ** (shift - (len(targets) - 1) / 2)  # so that intervals stand apart
+        x = np.array(sizes) * 1.04 ** (shift - (len(targets) - 1) / 2)  # so that intervals do not overlap
         spread = (middle - low, high - middle)
         panel.errorbar(
             x, middle, yerr=spread, label=target, marker="o", ms=5, capsize=3, color=COLOURS[target]

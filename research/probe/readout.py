@@ -1,7 +1,7 @@
-"""Probes: how much of the proximity a ridge regression and a small network read from a representation.
+"""Measure how much of the proximity a ridge regression and a small network read from a representation.
 
-Errors are kept per episode, because steps of one episode are not independent samples: intervals
-come from drawing episodes, and trainings, with replacement.
+Errors are summed per episode, because steps of one episode are not independent samples: intervals
+come from resampling episodes, and trainings, with replacement.
 """
 
 import copy
@@ -16,12 +16,12 @@ from jobs.analysis.statistics import CONFIDENCE, RESAMPLES
 from models.policy.networks import mlp
 from research.probe.dataset import ProbeData
 
-INNER_SHARE = 0.2  # of the training episodes, the last ones, choose the penalty and when to stop
-PENALTIES = (1e-8, 1e-6, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)  # of a squared weight, in squared deviations
+INNER_SHARE = 0.2  # last share of the training episodes, to choose the penalty and when to stop
+PENALTIES = (1e-8, 1e-6, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)  # penalties of a squared weight, in squared deviations
 HIDDEN = (64, 64)
 LEARNING_RATE, BATCH = 1e-3, 256
 MAX_EPOCHS, PATIENCE = 100, 8
-ROWS = 4096  # that are converted to float64 at once
+ROWS = 4096  # rows that are converted to float64 at once
 
 Interval = tuple[float, float, float]  # mean, and the ends of the 95 % interval
 
@@ -31,7 +31,7 @@ class Errors(NamedTuple):
 
     Attributes:
         ridge, network: Squared errors of the proximity.
-        bearing: Error of the bearing of the nearest obstacle, by the network [degrees].
+        bearing: Network's error of the bearing of the nearest obstacle [degrees].
     """
 
     ridge: np.ndarray
@@ -40,13 +40,13 @@ class Errors(NamedTuple):
 
 
 class Scores(NamedTuple):
-    """How much a representation holds, each with its interval.
+    """The scores of a representation, each with its interval.
 
     Attributes:
-        ridge, network: Share of the variance of the proximity, over all sectors, that is read
-            from it (R2): 0 for its mean, 1 for perfection.
-        bearing_deg: Mean error of the bearing of the nearest obstacle, where one is in
-            `research.probe.dataset.ALARM_M`, by the network [degrees].
+        ridge, network: Share of the variance of the proximity, over all sectors, that the probe
+            explains (R2): 0 for predicting the mean, 1 for perfect predictions.
+        bearing_deg: Network's mean error of the bearing of the nearest obstacle, over steps with one
+            within `research.probe.dataset.ALARM_M` [degrees].
     """
 
     ridge: Interval
@@ -62,10 +62,10 @@ def probe(x: np.ndarray, train: ProbeData, x_held_out: np.ndarray, held_out: Pro
         train: At least two episodes.
         x_held_out: (M, D).
         held_out: Other episodes.
-        seed: Of the network.
+        seed: Seed of the network.
 
     Raises:
-        ValueError: A number of a representation is not finite, or there is only one training episode.
+        ValueError: A representation has a value that is not finite, or there is only one training episode.
     """
     if not (np.isfinite(x).all() and np.isfinite(x_held_out).all()):
         raise ValueError("a representation must be finite, got NaN or infinity")
@@ -82,7 +82,7 @@ def probe(x: np.ndarray, train: ProbeData, x_held_out: np.ndarray, held_out: Pro
 
 
 def scores(errors: Sequence[Errors], held_out: ProbeData) -> Scores:
-    """The errors of one or more trainings as shares and degrees, with their intervals."""
+    """Return the scores of one or more trainings, with their intervals."""
     ridge_error, error, wrong = (np.stack(parts) for parts in zip(*errors, strict=True))
     deviations = np.square(held_out.proximity - held_out.proximity.mean(axis=0)).sum(axis=1)
     total = per_episode(deviations, held_out.episode)
@@ -92,12 +92,12 @@ def scores(errors: Sequence[Errors], held_out: ProbeData) -> Scores:
 
 
 def per_episode(values: np.ndarray, episode: np.ndarray) -> np.ndarray:
-    """Sums of values (N,) over the steps of each episode, float64 (F,)."""
+    """Return the sums of values (N,) over the steps of each episode, float64 (F,)."""
     return np.bincount(np.unique(episode, return_inverse=True)[1], weights=values)
 
 
 def inner_episodes(episode: np.ndarray) -> np.ndarray:
-    """Bool (N,): the steps of the last episodes, which the probes are not fitted to.
+    """Return a mask, bool (N,), of the steps of the last episodes, which choose penalty and stopping.
 
     Raises:
         ValueError: There is only one episode.
@@ -110,13 +110,13 @@ def inner_episodes(episode: np.ndarray) -> np.ndarray:
 
 
 def ridge(x: np.ndarray, y: np.ndarray, inner: np.ndarray, x_held_out: np.ndarray) -> np.ndarray:
-    """Predictions (M, K) by ridge regression in closed form; the penalty is the best for `inner` steps.
+    """Return predictions (M, K) of a closed-form ridge regression with the best penalty for `inner` steps.
 
-    All penalties share the normal equations. scikit-learn's Ridge forms them anew for each, which took
-    five to eight times as long on 20,000 rows, and holds all rows in float64.
+    All penalties share the normal equations. scikit-learn's Ridge computes them for each penalty, which took
+    five to eight times as long on 20,000 rows, and it converts all rows to float64.
 
     Args:
-        x: float32 (N, D), of mean 0 and deviation 1.
+        x: float32 (N, D), with mean 0 and deviation 1.
         y: (N, K).
         inner: bool (N,).
         x_held_out: float32 (M, D).
@@ -137,7 +137,7 @@ class Equations(NamedTuple):
 
 
 def normal_equations(x: np.ndarray, y: np.ndarray, chosen: np.ndarray) -> Equations:
-    """Of the chosen rows, float64."""
+    """Return the normal equations of the chosen rows, float64."""
     square, moment = np.zeros((x.shape[1], x.shape[1])), np.zeros((x.shape[1], y.shape[1]))
     places = np.flatnonzero(chosen)
     for first in range(0, len(places), ROWS):
@@ -149,15 +149,15 @@ def normal_equations(x: np.ndarray, y: np.ndarray, chosen: np.ndarray) -> Equati
 
 
 def solve(equations: Equations, penalty: float) -> np.ndarray:
-    """Weights (D, K) of least mean squared error plus `penalty` times their squares."""
+    """Return the weights (D, K) that minimize the mean squared error plus `penalty` times their squares."""
     damped = equations.square + penalty * equations.rows * np.eye(len(equations.square))
     return cho_solve(cho_factor(damped, overwrite_a=True), equations.moment)
 
 
 def network(x: np.ndarray, y: np.ndarray, inner: np.ndarray, x_held_out: np.ndarray, seed: int) -> np.ndarray:
-    """Predictions (M, K) of two dense tanh layers, trained until the `inner` steps' error stops falling.
+    """Return predictions (M, K) of two dense tanh layers; training stops by the error of `inner` steps.
 
-    The arguments are those of `ridge`; `seed` is of weights and batches.
+    The arguments are as in `ridge`; `seed` is the seed of weights and batches.
     """
     torch.manual_seed(seed)
     rng = np.random.default_rng(seed)
@@ -188,15 +188,15 @@ def network(x: np.ndarray, y: np.ndarray, inner: np.ndarray, x_held_out: np.ndar
 
 
 def ratio_interval(top: np.ndarray, bottom: np.ndarray) -> Interval:
-    """Ratio of sums with its 95 % bootstrap interval; NaN where there is nothing to divide by.
+    """Return a ratio of sums with its 95 % bootstrap interval; NaN if the sum of `bottom` is not positive.
 
     Args:
-        top: float64 (S, F), of each training and each episode; trainings have equal weight.
-        bottom: float64 (F,), of each episode.
+        top: Values per training and episode, float64 (S, F); trainings have equal weight.
+        bottom: Values per episode, float64 (F,).
 
     Returns:
-        The ratio, and the quantiles of what it is over trainings and episodes drawn with
-        replacement. The draws are the same for all that have as many of both.
+        The ratio, and the quantiles of the ratio over trainings and episodes drawn with
+        replacement. The draws depend only on the numbers of trainings and episodes.
     """
     if not bottom.sum() > 0:
         return np.nan, np.nan, np.nan

@@ -1,1 +1,1 @@
-"""What a camera that slides sideways tells of the depth before it, recorded and simulated."""
+"""Measure what the events of a sideways sliding camera say about depth, recorded and simulated."""

@@ -1,7 +1,7 @@
-"""Depth from frames of a camera that slides sideways by known ways: multiple-baseline stereo.
+"""Compute depth from frames of a camera that slides sideways by known distances: multiple-baseline stereo.
 
-A point at depth Z moves by focal * way / Z pixels against the way. For each depth that is tried all frames
-are moved back by that much; where it is the true one they agree with the reference (Okutomi & Kanade 1993).
+A point at depth Z moves by focal * distance / Z pixels, opposite to the camera. For each candidate depth all
+frames are shifted back by that much; at the true depth they agree with the reference (Okutomi & Kanade 1993).
 """
 
 from typing import NamedTuple
@@ -10,11 +10,11 @@ import numpy as np
 from scipy.ndimage import map_coordinates, uniform_filter
 
 WINDOW = 9  # pixels of a patch
-MOST_PER_M, TRIED = 4.0, 81  # inverse depths [1 / m]
+MOST_PER_M, TRIED = 4.0, 81  # largest inverse depth [1 / m], and number of candidates
 
 
 class Lens(NamedTuple):
-    """A pinhole with the distortion of Brown (1966), as OpenCV orders it; pixels where it has a unit."""
+    """A pinhole with the distortion of Brown (1966), ordered as in OpenCV; lengths in pixels."""
 
     fx: float
     fy: float
@@ -28,7 +28,7 @@ class Lens(NamedTuple):
 
 
 def distorted(lens: Lens, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Row and column at which the lens shows what a pinhole shows at each pixel, float64 (H, W) each."""
+    """Return the row and column at which the lens shows each pixel of a pinhole, float64 (H, W) each."""
     row, column = np.mgrid[: shape[0], : shape[1]].astype(np.float64)
     x, y = (column - lens.cx) / lens.fx, (row - lens.cy) / lens.fy
     r = x * x + y * y
@@ -39,7 +39,7 @@ def distorted(lens: Lens, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarra
 
 
 def straightened(picture: np.ndarray, lens: Lens) -> np.ndarray:
-    """A picture (H, W) as a pinhole had taken it, float64."""
+    """Return a picture (H, W) as a pinhole would have taken it, float64."""
     return map_coordinates(
         picture.astype(np.float64), distorted(lens, picture.shape), order=1, mode="nearest"
     )
@@ -48,16 +48,16 @@ def straightened(picture: np.ndarray, lens: Lens) -> np.ndarray:
 def inverse_depth(
     pictures: np.ndarray, ways_m: np.ndarray, reference: int, focal: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Inverse depth [1 / m] at each pixel of one of the pictures, and how well it is known.
+    """Return the inverse depth [1 / m] at each pixel of one of the pictures, and its confidence.
 
     Args:
         pictures: float64 (K, H, W), of a pinhole.
-        ways_m: To the right, of each picture [m], (K,).
-        reference: Which picture.
+        ways_m: Position of the camera to the right at each picture [m], (K,).
+        reference: Index of the picture.
         focal: Focal length [pixels].
 
     Returns:
-        float64 (H, W) twice; the second is the mean error of all depths over that of the best one.
+        float64 (H, W) twice; the second is the mean error of all depths divided by the error of the best.
     """
     tried = np.linspace(0.0, MOST_PER_M, TRIED)
     normal = np.stack([_normalised(picture) for picture in pictures])
@@ -79,14 +79,14 @@ def inverse_depth(
 
 
 def _normalised(picture: np.ndarray) -> np.ndarray:
-    """A picture less its local mean, in local standard deviations and two greys: flat parts stay flat."""
+    """Subtract the local mean, divide by the local deviation plus two greys: flat parts stay flat."""
     mean = uniform_filter(picture, 2 * WINDOW + 1)
     spread = np.sqrt(np.maximum(uniform_filter(picture * picture, 2 * WINDOW + 1) - mean * mean, 0.0))
     return (picture - mean) / (spread + 2.0)
 
 
 def _columns(picture: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """A picture read at fractional columns, (W,)."""
+    """Interpolate a picture at fractional columns, (W,)."""
     left = np.minimum(at.astype(np.int64), picture.shape[1] - 2)
     share = at - left
     return picture[:, left] * (1.0 - share) + picture[:, left + 1] * share

@@ -1,8 +1,8 @@
 """What a probe that is fitted in simulation reads of a real, sliding camera's events: the depth before it.
 
 Run: python -m platform.launch +exp=sliding sliding.folder=slider_depth camera=davis240_slider
-Expect: a minute or two; a table of correlations between proximity read and true, in simulation and for the
-recording, with the ideal camera and with the one that is configured; `sliding/read.png` in the run folder.
+Expect: a minute or two; a table of correlations between read and true proximity, in simulation and for the
+recording, with the ideal and with the configured camera; `sliding/read.png` in the run folder.
 """
 
 import dataclasses
@@ -41,11 +41,11 @@ from research.probe.readout import inner_episodes, ridge
 from research.sliding.depth import Lens, distorted, inverse_depth, straightened
 from research.sliding.world import Slide, record_slides
 
-SCALE = 10.0  # metres of the simulated world to one of the recording
-KNOWN = 2.0  # how much better than others a depth must fit the frames
-SPAN_S = 0.7  # of the frames that the depth is found from: the longer, the wider the base line
-EVERY = 2  # of these frames
-BLOCK = 3  # sectors that are drawn together for intervals: neighbours show the same things
+SCALE = 10.0  # metres of the simulated world per metre of the recording
+KNOWN = 2.0  # least confidence of a depth, as returned by `inverse_depth`
+SPAN_S = 0.7  # of the frames for a depth map: the longer, the wider the baseline
+EVERY = 2  # use every second one of these frames
+BLOCK = 3  # sectors resampled together for intervals, because neighbours see the same obstacles
 DRAWS = 2000
 STACK = 6  # control steps that are read together
 KINDS = {"latents": "latents", "columns": "image columns"}
@@ -57,14 +57,15 @@ Key = tuple[str, str, str]  # events, camera, what is read
 
 @dataclass(frozen=True, config=STRICT)
 class Settings:
-    """Which recording of a sliding camera is read, and by a probe of which encoder.
+    """The recording of a sliding camera, and the policy whose encoder is probed.
 
     Attributes:
-        folder: Holds images.txt, calib.txt, groundtruth.txt, as Mueggler et al. (IJRR 2017) made them.
-        events: The event file in it.
-        frame_delay_us: From the time of a frame to the middle of its exposure [us].
+        folder: Folder with images.txt, calib.txt and groundtruth.txt in the format of Mueggler et al.
+            (IJRR 2017).
+        events: The event file in the folder.
+        frame_delay_us: Time from a frame's timestamp to the middle of its exposure [us].
         policy: A name in models/pretrained, "newest", or a path.
-        episodes: Simulated, to fit the probe to.
+        episodes: Simulated episodes to fit the probe.
     """
 
     folder: Name
@@ -75,12 +76,13 @@ class Settings:
 
 
 class Truth(NamedTuple):
-    """What the frames say.
+    """Depth and motion found from the frames.
 
     Attributes:
-        inverse_per_m: Of frames with events, as the lens shows it, float64 (K, H, W); NaN: unknown [1 / m].
-        times_us: Of these frames [us].
-        speed_mps: Of the camera, to the right.
+        inverse_per_m: Inverse depth in frames with events, as seen through the lens [1 / m], float64
+            (K, H, W); NaN: unknown.
+        times_us: Times of these frames [us].
+        speed_mps: Speed of the camera to the right [m/s].
         focal: Focal length [pixels].
     """
 
@@ -91,13 +93,13 @@ class Truth(NamedTuple):
 
 
 class Score(NamedTuple):
-    """How proximity read agrees with the true one; (value, low, high) each.
+    """Agreement of the read proximity with the true proximity; (value, low, high) each.
 
     Attributes:
         together: Correlation over steps and sectors.
-        over_time: Of the means over the steps of an episode.
-        error: Squared error, as a share of that of what is usual in training.
-        read: The proximity read.
+        over_time: Correlation of the means over the steps of an episode.
+        error: Squared error, relative to the error of always predicting the mean of training.
+        read: The read proximity.
     """
 
     together: tuple[float, float, float]
@@ -110,7 +112,7 @@ def run(config: Config) -> dict[str, Score]:
     """Fit probes in simulation, apply them to the recording; return the scores.
 
     Raises:
-        ConfigError: A file of the folder is refused, or the policy has no event VAE.
+        ConfigError: A file of the folder cannot be used, or the policy has no event VAE.
     """
     chosen = config.own
     found = find_one_policy("sliding.policy", chosen.policy, config, locate_run(config))
@@ -151,10 +153,10 @@ def run(config: Config) -> dict[str, Score]:
 
 
 def read_folder(folder: Path, events: str, delay_us: int) -> tuple[Truth, Footage, np.ndarray]:
-    """A folder as Mueggler et al. (2017) made them: events, images.txt, calib.txt, groundtruth.txt.
+    """Read a folder in the format of Mueggler et al. (2017): events, images.txt, calib.txt, groundtruth.txt.
 
     Raises:
-        ValueError: A file is refused, or the camera did more than move sideways.
+        ValueError: A file cannot be used, or the camera did not only move sideways.
     """
     lens = read_lens(folder / "calib.txt")
     poses = np.loadtxt(folder / "groundtruth.txt")
@@ -174,10 +176,10 @@ def read_folder(folder: Path, events: str, delay_us: int) -> tuple[Truth, Footag
 
 
 def read_lens(path: Path) -> Lens:
-    """The lens of a text file of 4 to 9 numbers.
+    """Read a lens from a text file of 4 to 9 numbers.
 
     Raises:
-        ValueError: It has others.
+        ValueError: The file has something else.
     """
     text = path.read_text()
     try:
@@ -195,7 +197,7 @@ def read_lens(path: Path) -> Lens:
 def find_depth(
     pictures: np.ndarray, times_us: np.ndarray, inside: np.ndarray, poses: np.ndarray, lens: Lens
 ) -> Truth:
-    """Inverse depth of the frames with events, bool (K,), from those and later ones."""
+    """Find the inverse depth of frames `inside`, bool (K,), from frames up to `SPAN_S` after the first."""
     first = int(np.flatnonzero(inside)[0])
     used = np.flatnonzero((times_us >= times_us[first]) & (times_us <= times_us[first] + 1e6 * SPAN_S))
     ways_m = np.interp(1e-6 * times_us, poses[:, 0], poses[:, 1])
@@ -211,7 +213,7 @@ def find_depth(
 
 
 def undistorted(lens: Lens, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Row and column of a pinhole's picture nearest to what the lens shows at each pixel, int64 (H, W)."""
+    """Return the nearest row and column in a pinhole's picture for each pixel of the lens, int64 (H, W)."""
     row, column = np.mgrid[: shape[0], : shape[1]]
     down, across = distorted(lens, shape)
     back = np.rint(2 * row - down).astype(np.int64), np.rint(2 * column - across).astype(np.int64)
@@ -219,17 +221,17 @@ def undistorted(lens: Lens, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndar
 
 
 def seen_through(truth: Truth, footage: Footage, env: EnvConfig) -> CameraConfig:
-    """The policy's camera with the field of view of the middle of the frames."""
+    """Return the policy's camera with the field of view of the middle of the frames."""
     shape = footage.luminance.shape[1:]
     across = min(shape[0] / env.camera.height, shape[1] / env.camera.width) * env.camera.width
     return dataclasses.replace(env.camera, fov_deg=2.0 * math.degrees(math.atan(0.5 * across / truth.focal)))
 
 
 def windows_of(events: np.ndarray, truth: Truth, footage: Footage, env: EnvConfig) -> ProbeData:
-    """The control steps of events of the frames' size, as the policy's camera has them, and their proximity.
+    """Convert events of the frames' size to control steps of the policy's camera, with their proximity.
 
-    Proximity is exp(-depth / 1 m), of the median depth in each sector of the middle: what it is of the poles
-    of the simulated world, which fill most of a sector and are ten times as far.
+    Proximity is exp(-depth / 1 m) of the median depth in each sector of the middle. This matches the poles of
+    the simulated world, which fill most of a sector and are `SCALE` times as far away.
     """
     shape, begin = footage.luminance.shape[1:], int(footage.times_us[0])
     part, middle = cropped(events, shape, env.camera)
@@ -247,7 +249,7 @@ def windows_of(events: np.ndarray, truth: Truth, footage: Footage, env: EnvConfi
 
 
 def _middle(inverse: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Median inverse depth of each sector of columns, (SECTORS,); 0: nothing is known."""
+    """Return the median inverse depth of each sector of columns, (SECTORS,); 0 if no depth is known."""
     sectors = (inverse[:, math.floor(a) : math.ceil(b)] for a, b in itertools.pairwise(edges))
     return np.array([np.nanmedian(part) if np.isfinite(part).any() else 0.0 for part in sectors])
 
@@ -255,7 +257,7 @@ def _middle(inverse: np.ndarray, edges: np.ndarray) -> np.ndarray:
 def read_from(
     kind: str, evae: EventVAE, train: ProbeData, parts: Mapping[str, ProbeData]
 ) -> dict[str, tuple[ProbeData, np.ndarray]]:
-    """Each part, and the proximity that a ridge regression of `train` reads from it, (N, SECTORS)."""
+    """Return each part with the proximity (N, SECTORS) that a ridge regression of `train` reads from it."""
 
     def features(data: ProbeData) -> np.ndarray:
         own = latents(data, evae) if kind == "latents" else column_features(data, evae.grid)
@@ -272,9 +274,9 @@ def read_from(
 
 
 def score(data: ProbeData, read: np.ndarray, train: ProbeData, single: bool) -> Score:
-    """How proximity read (N, SECTORS) agrees with the true one.
+    """Return how well read proximity (N, SECTORS) agrees with the true proximity.
 
-    Intervals draw episodes, or, where there is only a single one, blocks of neighbouring sectors.
+    Intervals come from resampling episodes or, for a single episode, blocks of neighbouring sectors.
     """
     steps = np.bincount(data.episode)[0]
     truth, read = (part.reshape(-1, steps, SECTORS) for part in (data.proximity, read))
@@ -290,29 +292,29 @@ def score(data: ProbeData, read: np.ndarray, train: ProbeData, single: bool) -> 
 
 
 def _blocks(part: np.ndarray) -> np.ndarray:
-    """(1, steps, SECTORS) as (SECTORS / BLOCK, steps, BLOCK)."""
+    """Reshape (1, steps, SECTORS) to (SECTORS / BLOCK, steps, BLOCK)."""
     return part[0].reshape(part.shape[1], -1, BLOCK).swapaxes(0, 1)
 
 
 def _agreement(truth: np.ndarray, read: np.ndarray, usual: np.ndarray) -> tuple[float, float, float]:
-    """Correlation of all, of the means over time, and squared error as a share of that of the usual."""
+    """Return correlation of all values and of means over time, and squared error relative to `usual`."""
     means = truth.mean(axis=1).ravel(), read.mean(axis=1).ravel()
     error = np.square(read - truth).mean() / np.square(usual - truth).mean()
     return _correlation(truth.ravel(), read.ravel()), _correlation(*means), float(error)
 
 
 def _correlation(a: np.ndarray, b: np.ndarray) -> float:
-    """Pearson's; NaN where one of both is constant."""
+    """Return Pearson's correlation; NaN if either is constant."""
     return float(np.corrcoef(a, b)[0, 1]) if np.ptp(a) > 0.0 and np.ptp(b) > 0.0 else math.nan
 
 
 def text(part: Sequence[float]) -> str:
-    """A value with its interval."""
+    """Return a value with its interval as text."""
     return f"{part[0]:.2f} [{part[1]:.2f}, {part[2]:.2f}]"
 
 
 def plot_read(real: ProbeData, scores: Mapping[Key, Score]) -> Figure:
-    """Draw true proximity and what is read from the recording, means over time, from left to right."""
+    """Draw true proximity and proximity read from the recording, means over time, from left to right."""
     figure = Figure(figsize=(6.8, 3.6), layout="constrained")
     panel = figure.subplots()
     panel.step(range(SECTORS), real.proximity.mean(axis=0), color=INK, lw=2.2, where="mid", label="true")

@@ -1,4 +1,4 @@
-"""A simulated camera that slides sideways past poles, and the proximity of the nearest one in each sector."""
+"""Simulate a camera that slides sideways past poles, with the proximity of the nearest pole per sector."""
 
 import dataclasses
 
@@ -15,8 +15,8 @@ from models.encoder.evae import SECTORS
 from research.probe.dataset import ProbeData
 
 HEIGHT_M, SAMPLES = 2.0, 2
-SIDE_M, ALONG_M = 8.0, 60.0  # where a camera begins
-CLEAR_M = 3.0  # before it at the start
+SIDE_M, ALONG_M = 8.0, 60.0  # range of a camera's start [m], sideways and along
+CLEAR_M = 3.0  # clear distance ahead of the camera at the start
 POLES = {
     **{"num_obstacles": 100, "radius_min_m": 0.2, "radius_max_m": 1.0, "min_gap_m": 2.1},
     **{"albedo_min": 0.05, "albedo_max": 0.6, "wall_albedo": 0.6, "passable": False},
@@ -28,13 +28,13 @@ POLES = {
 
 @dataclasses.dataclass(frozen=True)
 class Slide:
-    """How the camera moves and sees.
+    """The sensor and its motion.
 
     Attributes:
         camera, faults: The sensor.
-        speed_mps: To the right [m/s].
+        speed_mps: Speed to the right [m/s].
         control_hz: Steps per second [Hz].
-        steps: Of an episode.
+        steps: Steps per episode.
     """
 
     camera: CameraConfig
@@ -45,7 +45,7 @@ class Slide:
 
 
 def record_slides(slide: Slide, episodes: int, seed: int) -> ProbeData:
-    """The windows of so many episodes, each in a world of its own, and the proximity at the end of each."""
+    """Record episodes, each in its own world: the window of each step, and the proximity at its end."""
     rng = np.random.default_rng(seed)
     windows, near = [], []
     for _ in range(episodes):
@@ -61,7 +61,7 @@ def record_slides(slide: Slide, episodes: int, seed: int) -> ProbeData:
 
 
 def _episode(slide: Slide, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Events, ends of the steps [us] with the start before them, and proximity (steps, SECTORS)."""
+    """Return events, start and ends of the steps [us], and proximity (steps, SECTORS)."""
     camera = slide.camera
     while True:
         scene = make_scene("poles", rng, **POLES)
@@ -84,5 +84,5 @@ def _episode(slide: Slide, rng: np.random.Generator) -> tuple[np.ndarray, np.nda
 
 
 def _scan(scene: Scene, place: tuple[float, float], fov_deg: float) -> np.ndarray:
-    """Proximity of the nearest pole in each sector, float64 (SECTORS,)."""
+    """Return the proximity of the nearest pole in each sector, float64 (SECTORS,)."""
     return sector_proximity(scene, (*place, HEIGHT_M, 0.0), fov_deg, SECTORS)

@@ -1,10 +1,10 @@
 """Shapes of obstacles: one row each in `SHAPES`, and a file if it is composed of several bodies.
 
-A new shape is a file with a function that composes it from poles, cones, ellipsoids and boxes (`tree.py` is
-the shortest), a row below, and a test. Renderers, collisions, passability and the planner know these four
-kinds of body, so nothing else changes: a gate is four boxes, a tree is an ellipsoid on a pole. Bodies may
-touch but not overlap; one may float above another. A body that cannot be composed of the four is a mesh
-(`envs.scene.layouts.MeshLayout`), which pyrender draws.
+To add a shape, write a file with a function that composes it from poles, cones, ellipsoids and boxes
+(`tree.py` is the shortest), a row below, and a test. Renderers, collisions, passability and the planner
+handle these four kinds of body, so nothing else changes: a gate is four boxes, a tree is an ellipsoid on a
+pole. Bodies may touch but not overlap; one may float above another. A shape that cannot be composed of
+these four kinds is a mesh (`envs.scene.layouts.MeshLayout`), which pyrender draws.
 
 A plug-in adds a row: `SHAPES["arch"] = Shape(BOX, compose_arches)`.
 """

@@ -1,4 +1,4 @@
-"""Gates: a frame across the lane, from the ground up, that the vehicle flies through."""
+"""Gates: frames across the lane that stand on the ground and that the vehicle flies through."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ BAR_M = 0.4  # thickness of a gate's posts, lintel and sill
 
 
 def compose_gates(openings: np.ndarray) -> np.ndarray:
-    """Return left posts, right posts, lintels and sills, (4 N,) OBSTACLE, of openings of half-width rx."""
+    """Return the left post, right post, lintel and sill of each opening of half-width rx, (4 N,) OBSTACLE."""
     bar = 0.5 * BAR_M
     parts = np.tile(openings, (4, 1))
     parts["ry"] = bar

@@ -5,11 +5,11 @@ import numpy as np
 from envs.scene.obstacles import ELLIPSOID, POLE
 from envs.scene.shapes.shape import Shape
 
-TRUNK_SHARE = 0.25  # of the crown's radius, and of the tree's height below the crown
+TRUNK_SHARE = 0.25  # trunk radius over crown radius, and trunk height over the tree's height
 
 
 def compose_trees(places: np.ndarray) -> np.ndarray:
-    """Return trunks and crowns, (2 N,) OBSTACLE; the crown has the layout's radius and rests on the trunk."""
+    """Return a trunk and a crown for each place, (2 N,) OBSTACLE; the crown has the layout's radius."""
     parts = np.tile(places, (2, 1))
     trunk, crown = parts
     trunk["kind"] = POLE

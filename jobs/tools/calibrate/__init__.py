@@ -1,1 +1,1 @@
-"""The settings of the simulated camera with which it does what a recorded one did."""
+"""Calibrate the simulated camera: find the settings that reproduce a recording."""

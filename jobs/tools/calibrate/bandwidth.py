@@ -1,9 +1,8 @@
-"""Bandwidth of the photoreceptors: the one behind which all events of a pixel stand on one staircase.
+"""Estimate the bandwidth of the photoreceptors: with the right one, a pixel's events fit one staircase.
 
-Where the light moves fast the response lags behind it, the more the lower the bandwidth; with another
-bandwidth than the true one, events of rises and falls, of fast and slow ones, ask for different levels. Noise
-lets a pixel fire early, on average by the same part of a threshold in all rises and falls, which is taken
-off.
+The response lags behind fast light, the more the lower the bandwidth. With a wrong bandwidth, events of
+rises and falls, and of fast and slow changes, imply different levels. Noise makes a pixel fire early, on
+average by the same fraction of a threshold in all rises and falls; this fraction is subtracted.
 """
 
 import dataclasses
@@ -16,10 +15,10 @@ from jobs.tools.calibrate.footage import Trains, light_behind, of_columns
 from jobs.tools.calibrate.found import TAILS, Found, missing, resampled, with_interval
 from jobs.tools.calibrate.thresholds import equations, staircase
 
-MOST_PIXELS = 128  # the most active ones
+MOST_PIXELS = 128  # number of the most active pixels to use
 LOWEST_HZ, HIGHEST_HZ, COARSE, FINE = 2.0, 4000.0, 10, 7
-NO_FIT = 1e9  # thresholds off the staircase
-# Time constants from frame to frame, at most: between frames the light is not known, and taken as linear.
+NO_FIT = 1e9  # misfit [thresholds] if no staircase can be fitted
+# Largest frame interval in time constants: between frames the light is unknown and assumed to be linear.
 COARSEST = 4.0
 UNLIMITED = "frames and events fit an unlimited bandwidth as well"
 
@@ -27,13 +26,13 @@ UNLIMITED = "frames and events fit an unlimited bandwidth as well"
 def misfit(
     trains: Trains, luminance: np.ndarray, times_us: np.ndarray, camera: CameraConfig, refractory_us: float
 ) -> np.ndarray:
-    """Compute the deviation of each pixel's events from one staircase, in thresholds, float64 (P,), summed.
+    """Sum the deviations of each pixel's events from one staircase, in thresholds, float64 (P,).
 
     Args:
         trains: Events of P pixels.
-        luminance: float32 (K, P) of frames.
-        times_us: Theirs [us].
-        camera: With the bandwidth to try.
+        luminance: Luminance of the frames, white = 1, float32 (K, P).
+        times_us: Times of the frames [us].
+        camera: The camera with the bandwidth to try.
         refractory_us: Dead time [us].
     """
     light = light_behind(luminance, times_us, camera)
@@ -58,7 +57,7 @@ def bandwidth(
     refractory_us: float,
     rng: np.random.Generator,
 ) -> Found:
-    """Cutoff of the photoreceptors [Hz], with its interval over pixels; arguments as of `misfit`."""
+    """Estimate the photoreceptors' cutoff [Hz], with an interval over pixels; arguments as in `misfit`."""
     active = np.bincount(trains.pixel, minlength=luminance.shape[1])
     chosen = np.sort(np.argsort(-active, kind="stable")[:MOST_PIXELS])
     trains, luminance = of_columns(trains, chosen), np.ascontiguousarray(luminance[:, chosen])
@@ -87,13 +86,13 @@ def bandwidth(
 
 
 def time_constant_s(cutoff_hz: float, luminance: np.ndarray, camera: CameraConfig) -> float:
-    """Time constant of the filter under the median of luminances, white = 1 [s]."""
+    """Return the time constant of the filter at the median luminance [s]; white = 1."""
     black, white = filter_rates(dataclasses.replace(camera, cutoff_hz=cutoff_hz))
     return 1.0 / (black + white * float(np.median(luminance)))
 
 
 def lowest(cutoffs: np.ndarray, totals: np.ndarray) -> np.ndarray:
-    """Find the vertex of a parabola in log cutoff through the least of each row (D, F) and its neighbours."""
+    """Return the minimum of each row of totals (D, F), refined by a parabola in log cutoff."""
     place = np.clip(totals.argmin(axis=1), 1, totals.shape[1] - 2)
     rows = np.arange(len(totals))
     before, at, after = (totals[rows, place + k] for k in (-1, 0, 1))

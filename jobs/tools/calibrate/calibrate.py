@@ -1,9 +1,9 @@
 """The settings of the simulated camera with which it does what a recorded one did, as a file of conf/camera.
 
 Run: python -m platform.launch +exp=calibrate calibrate.recording=events.txt calibrate.frames=images.txt
-Expect: seconds to minutes. A table of settings with their intervals, the file `calibrate/camera.yaml` and the
-hot pixels in the run folder, and with frames a table and a figure of simulated events beside the recorded
-ones.
+Expect: seconds to minutes. A table of settings with their intervals; the file `calibrate/camera.yaml` and the
+hot pixels in the run folder; with frames also a table and a figure that compare simulated with recorded
+events.
 """
 
 import dataclasses
@@ -46,15 +46,15 @@ SIMULATED = (
 
 @dataclass(frozen=True, config=STRICT)
 class Settings:
-    """Which recording a camera is calibrated against.
+    """The recording to calibrate against.
 
     Attributes:
-        recording: An event file, of any format that `envs.recordings.read_events` knows.
-        frames: Text file with a line "seconds picture" for each frame of the same sensor, on the clock of the
-            events; None: the scene was still and uniform.
-        frame_delay_us: From the time of a frame to the middle of its exposure [us].
-        luminance: Of a still scene, white = 1.
-        camera: Name of the file in conf/camera that is written; None: only that in the run folder.
+        recording: An event file in any format that `envs.recordings.read_events` reads.
+        frames: Text file with a line "seconds picture" for each frame of the same sensor, with the clock of
+            the events. None: the event file's own frames; without these the scene was still and uniform.
+        frame_delay_us: Delay from the time of a frame to the middle of its exposure [us].
+        luminance: Luminance of a still scene, white = 1.
+        camera: Name of the file to write in conf/camera; None: only the file in the run folder.
     """
 
     recording: Name
@@ -65,10 +65,10 @@ class Settings:
 
 
 def run(config: Config) -> Calibration:
-    """Calibrate against `calibrate.recording`; return what was found.
+    """Calibrate against `calibrate.recording`; return the settings.
 
     Raises:
-        ConfigError: The recording or its frames are refused, or have too few events.
+        ConfigError: The recording or its frames are invalid, or there are too few events.
     """
     chosen, camera = config.own, config.env.camera
     frames: Footage | None
@@ -118,7 +118,7 @@ def within(footage: Footage, events: np.ndarray) -> Footage:
     """Return the frames during which events were recorded.
 
     Raises:
-        ValueError: Fewer than two.
+        ValueError: There are fewer than two such frames.
     """
     first, last = (int(events["t"][k]) for k in (0, -1)) if len(events) else (0, -1)
     kept = (footage.times_us >= first - 1) & (footage.times_us <= last)
@@ -131,16 +131,17 @@ def within(footage: Footage, events: np.ndarray) -> Footage:
 
 
 def assumed(camera: CameraConfig, still: bool) -> CameraConfig:
-    """Name the settings taken from the configured camera; all others are estimated, or ideal.
+    """Return a camera with the settings that are assumed to be as configured; all others are ideal.
 
-    That is how light becomes a response, and of a still scene the thresholds and the refractory period.
+    These are the conversion of light into a response, and for a still scene also the thresholds and the
+    refractory period.
     """
     names = (*OF_LIGHT, *OF_STILL) if still else OF_LIGHT
     return CameraConfig(**{name: getattr(camera, name) for name in names})
 
 
 def compared(calibration: Calibration, camera: CameraConfig, faults: FaultsConfig) -> dict[str, tuple]:
-    """Name -> camera and faults of the sensors that are simulated: ideal, as configured, calibrated."""
+    """Return name -> camera and faults of the sensors to simulate: ideal, as configured, calibrated."""
     height, width = calibration.hot.shape
     size = {"height": height, "width": width}
     sensors = {"ideal": (with_floor(CameraConfig(**size), LUMINANCE_FLOOR), FaultsConfig())}
@@ -154,7 +155,7 @@ def compared(calibration: Calibration, camera: CameraConfig, faults: FaultsConfi
 def _compare(
     config: Config, calibration: Calibration, footage: Footage, events: np.ndarray, folder: Path
 ) -> None:
-    """Simulate the frames with each camera; show and draw how like the recording that is."""
+    """Simulate the frames with each camera; print and draw a comparison with the recording."""
     shape, times_us = calibration.hot.shape, footage.times_us[1:]  # levels settle in the first interval
     inside = events[(events["t"] > times_us[0]) & (events["t"] <= times_us[-1])]
     rows = {"recorded": likeness(inside, inside, times_us, shape)}
@@ -170,7 +171,7 @@ def _compare(
 
 
 def texts(row: Likeness) -> tuple[str, ...]:
-    """Return a text for each of `SIMULATED` but the first."""
+    """Return a text for each of `SIMULATED` except the first."""
     return (
         f"{row.rate_hz:.2f}", f"{100 * row.on_share:.1f}", f"{100 * row.same_share:.1f}",
         f"{row.median_ms:.1f}", f"{row.neighbours:.2f}", f"{row.real:.3f}",
@@ -178,7 +179,7 @@ def texts(row: Likeness) -> tuple[str, ...]:
 
 
 def plot_likeness(rows: Mapping[str, Likeness]) -> Figure:
-    """Draw the intervals between events of a pixel, and the shares of ON and of same polarities."""
+    """Draw intervals between a pixel's events, shares of ON and of equal polarities, and correlations."""
     figure = Figure(figsize=(9.0, 3.4), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1.6, 1.0))
     colours = {"recorded": INK, "ideal": AMBER, "as configured": GREEN, "calibrated": BLUE}

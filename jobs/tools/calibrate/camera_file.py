@@ -1,4 +1,4 @@
-"""What was found, as a file of conf/camera."""
+"""Write a calibration as a file of conf/camera."""
 
 from envs.config import CameraConfig
 from jobs.tools.calibrate.estimate import DEAD, OFF, ON, Calibration
@@ -8,12 +8,12 @@ UNITS = {"hz": " [Hz]", "us": " [us]"}
 
 
 def camera_text(calibration: Calibration, source: str, taken: CameraConfig) -> str:
-    """Return the text of a file in conf/camera; it names the settings that were not found.
+    """Return the text of a file in conf/camera; comments name the settings that could not be estimated.
 
     Args:
-        calibration: What was found.
-        source: Of what, for the file's first line.
-        taken: The camera that was assumed.
+        calibration: The estimated settings.
+        source: Name of the recording, for the header of the file.
+        taken: The assumed camera.
     """
     height, width = calibration.hot.shape
     absent = [
@@ -40,7 +40,7 @@ def camera_text(calibration: Calibration, source: str, taken: CameraConfig) -> s
 
 
 def assumptions(calibration: Calibration, taken: CameraConfig) -> list[tuple[str, object]]:
-    """Keys and values of what was assumed and not found."""
+    """Return keys and values of the settings that were assumed instead of estimated."""
     keys = ["response", "luminance_floor"]
     if calibration.found[ON].value is None:
         keys += [
@@ -51,7 +51,7 @@ def assumptions(calibration: Calibration, taken: CameraConfig) -> list[tuple[str
 
 
 def value_text(name: str, part: Found) -> str:
-    """Return a value as YAML: whole microseconds, else three digits."""
+    """Return a value as YAML: the dead time in whole microseconds, others with three digits."""
     if name == DEAD:
         return str(round(part.value or 0.0))
     text = f"{part.value:.3g}"
@@ -59,5 +59,5 @@ def value_text(name: str, part: Found) -> str:
 
 
 def unit(key: str) -> str:
-    """Return the unit that a key ends with, in brackets."""
+    """Return the unit in brackets that the end of a key implies; "" if there is none."""
     return UNITS.get(key.rsplit("_", 1)[-1], "")

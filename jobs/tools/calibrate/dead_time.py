@@ -1,9 +1,9 @@
-"""Refractory period: how long a pixel is deaf after an event, where the light moves on in that time.
+"""Estimate the refractory period: how long a pixel ignores changing light after an event.
 
-At the end of its refractory period a pixel takes the light as its level, and fires one threshold later. So
-where the light moves by more than a threshold until a pixel's next event, the pixel was deaf for all of the
-interval but the part in which the light moved by a threshold. It was never deaf for longer than the shortest
-interval, which in a still scene is all that is known.
+At the end of its refractory period a pixel takes the current light as its level, and fires after a change by
+one more threshold. So if the light changes by more than a threshold until the pixel's next event, the pixel
+was deaf for all of the interval except the time of the last threshold. It was never deaf for longer than the
+shortest interval; a still scene gives only this upper limit.
 """
 
 import numpy as np
@@ -11,13 +11,16 @@ import numpy as np
 from jobs.tools.calibrate.footage import Light, Trains, looked_up
 from jobs.tools.calibrate.found import DRAWS, Found, missing, with_interval
 
-FEWEST_NEAR, NEAR = 5, 0.1  # so many intervals within a tenth: a single shorter one is a slip of the readout
-FEWEST, MOVED = 20, 1.4  # deaf intervals, and thresholds that the light moves in one
-AGREE = 2.5  # most that what deaf intervals say and the shortest one may differ by, as a factor
+FEWEST_NEAR, NEAR = 5, 0.1  # intervals within a tenth; isolated shorter ones are artefacts of the readout
+FEWEST, MOVED = 20, 1.4  # fewest deaf intervals; a deaf interval has a change by more thresholds than this
+AGREE = 2.5  # largest factor between the estimate from deaf intervals and the shortest interval
 
 
 def shortest_us(trains: Trains) -> float:
-    """Return the shortest interval with four others within a tenth of it [us]; infinite if there is none."""
+    """Return the shortest interval between a pixel's events [us], with four others at most a tenth longer.
+
+    Infinite if there is no such interval.
+    """
     intervals = np.sort(np.diff(trains.t_us)[np.diff(trains.pixel) == 0].astype(np.float64))
     far = np.searchsorted(intervals, (1.0 + NEAR) * intervals, side="right")
     credible = intervals[far - np.arange(intervals.size) >= FEWEST_NEAR]
@@ -27,7 +30,7 @@ def shortest_us(trains: Trains) -> float:
 def refractory_period(
     trains: Trains, light: Light, thresholds: tuple[float, float], rng: np.random.Generator
 ) -> Found:
-    """Estimate the refractory period [us], the median over deaf intervals, with its interval over these."""
+    """Estimate the refractory period [us]: the median over deaf intervals, with its 95 % interval."""
     at = looked_up(light.response, light.times_us, trains.pixel, trains.t_us)
     same = np.diff(trains.pixel) == 0
     polarity, lasted = trains.p[1:][same], np.diff(trains.t_us)[same].astype(np.float64)

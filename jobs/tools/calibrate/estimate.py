@@ -1,8 +1,8 @@
-"""All settings of a sensor from one recording, each by its own estimator, in the order of what needs what.
+"""Estimate all settings of a sensor from one recording, each by its own estimator, in order of dependence.
 
-Noise lets pixels fire early, and what that does to thresholds and bandwidth depends on everything else. So
-the frames are simulated with what was found, the same estimators look at that, and what they get wrong there
-is taken off.
+Noise makes pixels fire early, and its effect on thresholds and bandwidth depends on all other settings. So
+the frames are simulated with the estimated settings, the same estimators are applied to the simulated events,
+and their error there corrects the estimates.
 """
 
 import dataclasses
@@ -30,10 +30,10 @@ from jobs.tools.calibrate.likeness import net_images
 from jobs.tools.calibrate.noise import FEWEST_PIXELS, noise_rates, still_rates
 from jobs.tools.calibrate.thresholds import NEGLIGIBLE, equations, mismatch, thresholds
 
-STILL = 1 / 3  # of a threshold: a pixel whose response changes by less rests
+STILL = 1 / 3  # a pixel rests if its response changes by less than this share of a threshold
 FEWEST_EVENTS = 1000
-PARTS, TOGETHER = (1, 24), 0.1  # of a still recording; most correlation of neighbours in each part
-PASSES, SETTLED = 3, 0.02  # bandwidth and refractory period need each other
+PARTS, TOGETHER = (1, 24), 0.1  # parts of a still recording; largest correlation of neighbours in a part
+PASSES, SETTLED = 3, 0.02  # iterations of bandwidth and refractory period, which depend on each other
 ON, OFF, MISMATCH = "camera.contrast_threshold", "camera.contrast_threshold_off", "camera.threshold_mismatch"
 CUTOFF, DEAD = "camera.cutoff_hz", "camera.refractory_us"
 LEAK, SHOT = "faults.leak_hz", "faults.shot_noise_hz"
@@ -44,11 +44,11 @@ NEEDS_LIGHT = "a still scene does not tell it; give frames of a moving one with 
 
 
 class Calibration(NamedTuple):
-    """What a recording says of its sensor.
+    """Settings of a sensor estimated from a recording.
 
     Attributes:
-        found: One entry for each of `NAMES`.
-        hot: bool (H, W), the hot pixels.
+        found: Name in `NAMES` -> estimate.
+        hot: Mask of the hot pixels, bool (H, W).
     """
 
     found: dict[str, Found]
@@ -56,16 +56,17 @@ class Calibration(NamedTuple):
 
 
 def estimate(events: np.ndarray, footage: Footage, camera: CameraConfig, seed: int = 0) -> Calibration:
-    """Estimate the settings of the sensor that sent the events while it saw the frames.
+    """Estimate the settings of the sensor that reported the events while it saw the frames.
 
     Args:
-        events: EVENT, sorted by t; those before the first or after the last frame do not count.
+        events: EVENT, sorted by t; events before the first or after the last frame are ignored.
         footage: Frames of the sensor's size, or `still_footage`.
-        camera: Of which the response is taken, and where the recording does not tell a setting, that.
-        seed: Of resamples and of what is simulated for comparison.
+        camera: Supplies the response, and the settings that the recording does not determine.
+        seed: Seed of the resamples and of the simulated recording.
 
     Raises:
-        ValueError: There are too few events between the first and the last frame, or the scene was not still.
+        ValueError: There are too few events between the first and the last frame, or the scene of a recording
+            without frames was not still.
     """
     begin, end = int(footage.times_us[0]), int(footage.times_us[-1])
     events = events[(events["t"] > begin) & (events["t"] <= end)]
@@ -93,7 +94,7 @@ def estimate(events: np.ndarray, footage: Footage, camera: CameraConfig, seed: i
 
 
 def refuse_motion(events: np.ndarray, span_us: tuple[int, int], shape: tuple[int, int]) -> None:
-    """Raise ValueError where pixels fire together with their neighbours, which noise alone does not do."""
+    """Raise ValueError if neighbouring pixels fire together, which noise alone does not cause."""
     for parts in PARTS:
         images = net_images(events, np.linspace(*span_us, parts + 1), shape)
         sides = images[..., :-1].ravel(), images[..., 1:].ravel()
@@ -108,7 +109,7 @@ def refuse_motion(events: np.ndarray, span_us: tuple[int, int], shape: tuple[int
 def by_light(
     trains: Trains, footage: Footage, camera: CameraConfig, rng: np.random.Generator
 ) -> dict[str, Found]:
-    """Estimate what changing light shows: thresholds, mismatch, bandwidth, dead time."""
+    """Estimate the settings that changing light reveals: thresholds, mismatch, bandwidth, dead time."""
     if footage.is_still:
         return dict.fromkeys(BY_LIGHT, missing(NEEDS_LIGHT))
     flat, times_us = footage.flat, footage.times_us
@@ -129,7 +130,7 @@ def by_light(
 
 
 def by_noise(trains: Trains, footage: Footage, camera: CameraConfig, sound: np.ndarray) -> dict[str, Found]:
-    """Estimate leakage and shot noise from the sound pixels, bool (P,), whose light is constant."""
+    """Estimate leakage and shot noise from pixels under constant light among the `sound` ones, bool (P,)."""
     light = light_behind(footage.flat, footage.times_us, camera)
     least = min(camera.contrast_threshold, camera.contrast_threshold_off or camera.contrast_threshold)
     still = sound & (np.ptp(light.response, axis=0) < STILL * least)
@@ -145,7 +146,7 @@ def by_noise(trains: Trains, footage: Footage, camera: CameraConfig, sound: np.n
 def _rough(
     trains: Trains, footage: Footage, light: Light, camera: CameraConfig, rng: np.random.Generator
 ) -> tuple[float, float]:
-    """Thresholds before anything else is known."""
+    """Return the ON and OFF threshold, estimated without any other setting."""
     usual = camera.contrast_threshold, camera.contrast_threshold_off or camera.contrast_threshold
     if footage.is_still:
         return usual
@@ -154,7 +155,7 @@ def _rough(
 
 
 def with_found(camera: CameraConfig, found: Mapping[str, Found]) -> CameraConfig:
-    """Return a camera with the settings of a camera that were found."""
+    """Return a camera with its settings replaced by the estimated ones."""
     values: dict[str, Any] = _values(found, "camera.")
     if "refractory_us" in values:
         values["refractory_us"] = round(values["refractory_us"])
@@ -164,22 +165,22 @@ def with_found(camera: CameraConfig, found: Mapping[str, Found]) -> CameraConfig
 def settings(
     camera: CameraConfig, found: Mapping[str, Found], without: Collection[str] = ()
 ) -> tuple[CameraConfig, FaultsConfig]:
-    """Camera and faults with all that was found, without some of it."""
+    """Return camera and faults with the estimated settings, without the faults named in `without`."""
     faults: dict[str, Any] = _values({name: found[name] for name in found if name not in without}, "faults.")
     return with_found(camera, found), FaultsConfig(**faults)
 
 
 def _values(found: Mapping[str, Found], group: str) -> dict[str, float]:
-    """Return the fields of a group that have a value."""
+    """Return field -> value of a group's settings that have an estimate."""
     chosen = {name: part.value for name, part in found.items() if name.startswith(group)}
     return {name.removeprefix(group): value for name, value in chosen.items() if value is not None}
 
 
 def corrected(found: dict[str, Found], again: dict[str, Found]) -> dict[str, Found]:
-    """Correct an estimate by the ratio of true to estimated value in the simulated recording.
+    """Correct the estimates by the ratio of true to estimated value in the simulated recording.
 
-    The simulated recording is as uncertain as the recorded one, so the intervals grow by the root of two; and
-    they reach half as far as the correction at least. What no camera can have is not taken.
+    The simulated recording is as uncertain as the real one, so the intervals grow by the root of two. Each
+    side extends at least half as far as the correction. Values that no camera can have are dropped.
     """
     better = {}
     for name in BY_LIGHT:
@@ -197,7 +198,7 @@ def corrected(found: dict[str, Found], again: dict[str, Found]) -> dict[str, Fou
 
 
 def possible(name: str, part: Found) -> Found:
-    """Return a found setting if a camera can have its value; a mismatch only if it is not 0 as well."""
+    """Return an estimate if a camera can have its value; a mismatch that may be 0 only as an upper limit."""
     if name == MISMATCH and part.low < NEGLIGIBLE:
         return at_most(part.high)
     try:

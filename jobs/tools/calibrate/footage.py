@@ -1,4 +1,4 @@
-"""The frames of an event camera, what it sent, pixel by pixel, and the response of its pixels to light."""
+"""Frames of an event camera, its events ordered by pixel, and the response of its pixels to light."""
 
 from typing import NamedTuple
 
@@ -14,8 +14,8 @@ class Footage(NamedTuple):
     """Frames of a sensor.
 
     Attributes:
-        luminance: float32 (K, H, W), white = 1.
-        times_us: int64 (K,), ascending [us].
+        luminance: Linear luminance, white = 1, float32 (K, H, W).
+        times_us: Times of the frames, ascending, int64 (K,) [us].
     """
 
     luminance: np.ndarray
@@ -28,12 +28,12 @@ class Footage(NamedTuple):
 
     @property
     def is_still(self) -> bool:
-        """Whether nothing changes."""
+        """Whether all frames are equal."""
         return bool((self.luminance == self.luminance[0]).all())
 
 
 class Trains(NamedTuple):
-    """Events ordered by pixel, and by time in each.
+    """Events ordered by pixel, and by time within each pixel.
 
     Attributes:
         pixel: Flat pixel y * W + x, int64 (N,).
@@ -47,12 +47,12 @@ class Trains(NamedTuple):
 
 
 class Light(NamedTuple):
-    """What pixels responded to.
+    """Response of pixels to the light of frames.
 
     Attributes:
-        times_us: Of the frames, int64 (K,) [us].
-        response: Of each pixel in each frame, float64 (K, P).
-        travel: How far it had risen until then, all rises together, float64 (K, P).
+        times_us: Times of the frames, int64 (K,) [us].
+        response: Response of each pixel in each frame, float64 (K, P).
+        travel: Sum of all rises of the response up to each frame, float64 (K, P).
     """
 
     times_us: np.ndarray
@@ -61,12 +61,12 @@ class Light(NamedTuple):
 
 
 def still_footage(shape: tuple[int, int], luminance: float, span_us: tuple[int, int]) -> Footage:
-    """Return the frames of a uniform scene that never changes."""
+    """Return two equal frames of a uniform scene at the ends of a span [us]."""
     return Footage(np.full((2, *shape), luminance, np.float32), np.array(span_us, np.int64))
 
 
 def simulate(footage: Footage, camera: CameraConfig, faults: FaultsConfig, seed: int) -> np.ndarray:
-    """Events, EVENT, that the simulated sensor makes of frames of its size."""
+    """Simulate the events, EVENT, of a sensor that sees frames of its size."""
     eye, times = EventCamera(camera), footage.times_us.tolist()
     eye.reset(footage.luminance[0], times[0])
     sensor = RealSensor(camera, faults, (eye.state, eye.pixels), np.random.default_rng(seed), times[0])
@@ -75,29 +75,29 @@ def simulate(footage: Footage, camera: CameraConfig, faults: FaultsConfig, seed:
 
 
 def trains_of(events: np.ndarray, width: int) -> Trains:
-    """EVENT (N,), sorted by t, of a sensor with so many columns, as trains."""
+    """Convert EVENT (N,), sorted by t, of a sensor of this width into trains."""
     pixel = events["y"].astype(np.int64) * width + events["x"]
     order = np.argsort(pixel, kind="stable")
     return Trains(pixel[order], events["t"][order], events["p"][order].astype(np.float64))
 
 
 def of_pixels(trains: Trains, chosen: np.ndarray) -> Trains:
-    """Return the trains of the chosen pixels, bool (P,), which keep their numbers."""
+    """Return the trains of the chosen pixels, bool (P,), with unchanged pixel numbers."""
     kept = chosen[trains.pixel]
     return Trains(*(part[kept] for part in trains))
 
 
 def of_columns(trains: Trains, pixels: np.ndarray) -> Trains:
-    """Return the trains of some pixels, int64 (Q,) ascending, numbered by their place there."""
+    """Return the trains of some pixels, int64 (Q,) ascending, renumbered by their index in `pixels`."""
     place = np.minimum(np.searchsorted(pixels, trains.pixel), max(pixels.size - 1, 0))
     kept = pixels[place] == trains.pixel if pixels.size else np.zeros(trains.pixel.size, bool)
     return Trains(place[kept], trains.t_us[kept], trains.p[kept])
 
 
 def light_behind(luminance: np.ndarray, times_us: np.ndarray, camera: CameraConfig) -> Light:
-    """Return the responses of the frames after a camera's bandwidth, float32 (K, P), white = 1.
+    """Return the response to frames, float32 (K, P), white = 1, after the low-pass filter of a camera.
 
-    A bandwidth of 0 leaves all.
+    A cutoff of 0 Hz does not filter.
     """
     curve = _curve(camera)
     if camera.cutoff_hz > 0.0:
@@ -114,7 +114,10 @@ def light_behind(luminance: np.ndarray, times_us: np.ndarray, camera: CameraConf
 
 
 def looked_up(values: np.ndarray, times_us: np.ndarray, pixel: np.ndarray, t_us: np.ndarray) -> np.ndarray:
-    """Values of frames, (K, P), at pixels and times (N,): linear between frames, constant beyond the last."""
+    """Return values of frames (K, P) at pixels and times (N,).
+
+    Values are linear between frames, and constant before the first and after the last.
+    """
     late = np.clip(np.searchsorted(times_us, t_us), 1, times_us.size - 1)
     share = (t_us - times_us[late - 1]) / (times_us[late] - times_us[late - 1])
     share = np.clip(share, 0.0, 1.0)
@@ -129,5 +132,5 @@ def luminance_of(response: np.ndarray, camera: CameraConfig) -> np.ndarray:
 
 
 def _curve(camera: CameraConfig) -> Curve:
-    """Return how a camera's pixels respond to light."""
+    """Return the response curve of a camera's pixels."""
     return Curve(*response_curve(camera.response, camera.luminance_floor or LUMINANCE_FLOOR))

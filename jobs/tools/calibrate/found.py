@@ -1,4 +1,4 @@
-"""What was found of a setting: a value with its interval, or why there is none."""
+"""Estimate of a setting: a value with its interval, or the reason for its absence."""
 
 from typing import NamedTuple
 
@@ -11,10 +11,10 @@ TAILS = (1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2
 
 
 class Found(NamedTuple):
-    """A setting of the camera or its faults.
+    """Estimate of a setting of the camera or its faults.
 
     Attributes:
-        value: None: it cannot be told from this recording.
+        value: The estimate; None: this recording does not determine the setting.
         low, high: Ends of the 95 % interval.
         reason: Why there is no value.
     """
@@ -26,17 +26,17 @@ class Found(NamedTuple):
 
 
 def missing(reason: str) -> Found:
-    """Return a setting that cannot be estimated."""
+    """Return the estimate of a setting that cannot be determined."""
     return Found(None, reason=reason)
 
 
 def neither(reason: str) -> tuple[Found, Found]:
-    """Return two settings of which neither can be estimated."""
+    """Return two estimates that cannot be determined, for the same reason."""
     return missing(reason), missing(reason)
 
 
 def at_most(value: float) -> Found:
-    """Return a setting that may be 0."""
+    """Return an estimate without a value, with an upper limit as its reason."""
     return missing(f"at most {value:.2g}")
 
 
@@ -46,7 +46,7 @@ def resampled(pixels: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def with_interval(value: float, drawn: np.ndarray) -> Found:
-    """Return a value with the middle 95 % of its resamples, (D,); values that are no number do not count."""
+    """Return a value with the middle 95 % of its finite resamples, (D,), as its interval."""
     drawn = drawn[np.isfinite(drawn)]
     low, high = np.quantile(drawn, TAILS) if drawn.size else (np.nan, np.nan)
     return Found(float(value), float(low), float(high))

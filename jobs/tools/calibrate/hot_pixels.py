@@ -1,4 +1,4 @@
-"""Hot pixels: those that fire far more than the light of the frames, or a still scene, explains."""
+"""Find hot pixels, which fire far more often than the light explains."""
 
 import numpy as np
 
@@ -6,12 +6,12 @@ from jobs.analysis.statistics import wilson_interval
 from jobs.tools.calibrate.footage import Light, Trains
 from jobs.tools.calibrate.found import Found, missing, resampled, with_interval
 
-RARE = 0.98  # at most the rest of the pixels may be hot: what this share of them does is usual
+RARE = 0.98  # quantile of the pixels that defines the usual count; at most the rest is hot
 TIMES, SIGMAS, FEWEST = 2.0, 8.0, 10.0
 
 
 def unexplained(trains: Trains, light: Light, thresholds: tuple[float, float]) -> np.ndarray:
-    """Count events of each pixel beyond those of the rises and falls of its response, float64 (P,), >= 0."""
+    """Count the events of each pixel beyond those that its response explains, float64 (P,), >= 0."""
     count = np.bincount(trains.pixel, minlength=light.response.shape[1]).astype(np.float64)
     rise = light.travel[-1]
     fall = rise - (light.response[-1] - light.response[0])
@@ -19,7 +19,11 @@ def unexplained(trains: Trains, light: Light, thresholds: tuple[float, float]) -
 
 
 def hot_pixels(unexplained: np.ndarray) -> np.ndarray:
-    """Bool (P,): which pixels fire twice as often, and eight standard deviations more, than 98 % of all."""
+    """Return the hot pixels, bool (P,).
+
+    A hot pixel has more unexplained events than twice the 98 % quantile, eight standard deviations and ten
+    events together.
+    """
     usual = float(np.quantile(unexplained, RARE))
     return unexplained > TIMES * usual + SIGMAS * np.sqrt(TIMES * usual) + FEWEST
 
@@ -27,7 +31,7 @@ def hot_pixels(unexplained: np.ndarray) -> np.ndarray:
 def hot_settings(
     unexplained: np.ndarray, hot: np.ndarray, seconds: float, rng: np.random.Generator
 ) -> tuple[Found, Found]:
-    """Share of the pixels that are hot, and their rate beyond that of the others [Hz]."""
+    """Estimate the share of hot pixels, and their event rate beyond the other pixels' rate [Hz]."""
     low, high = wilson_interval(int(hot.sum()), hot.size)
     share = Found(float(hot.mean()), low, high)
     if not hot.any():

@@ -1,4 +1,4 @@
-"""How much simulated events are like recorded ones: rates, intervals, polarities, neighbours."""
+"""Compare simulated events with recorded ones: rates, intervals, polarities, neighbours."""
 
 from typing import NamedTuple
 
@@ -15,11 +15,12 @@ class Likeness(NamedTuple):
 
     Attributes:
         rate_hz: Events per pixel and second [Hz].
-        on_share: ON events, of all.
-        same_share: Events of the polarity of the pixel's event before.
-        median_ms: Between two events of a pixel [ms].
-        neighbours: Correlation of the net events of a pixel and its right neighbour between two frames.
-        real: The same of a pixel's net events, blurred, and the recorded ones (1 for these).
+        on_share: Share of ON events.
+        same_share: Share of events with the polarity of the pixel's previous event.
+        median_ms: Median interval between two events of a pixel [ms].
+        neighbours: Correlation between the net events of a pixel and its right neighbour, frame by frame.
+        real: Correlation between blurred net events and the recorded ones, frame by frame; 1 for the
+            recording itself.
         intervals: Share of the intervals in each of `INTERVALS_MS`, float64 (33,).
     """
 
@@ -33,7 +34,7 @@ class Likeness(NamedTuple):
 
 
 def net_images(events: np.ndarray, times_us: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Sum of polarities of each pixel between each frame and the next, float64 (K - 1, H, W)."""
+    """Sum the polarities of each pixel between each frame and the next, float64 (K - 1, H, W)."""
     interval = np.searchsorted(times_us, events["t"], side="left") - 1
     inside = (interval >= 0) & (interval < times_us.size - 1)
     flat = (interval * shape[0] + events["y"]) * shape[1] + events["x"]
@@ -44,7 +45,7 @@ def net_images(events: np.ndarray, times_us: np.ndarray, shape: tuple[int, int])
 def likeness(
     events: np.ndarray, recorded: np.ndarray, times_us: np.ndarray, shape: tuple[int, int]
 ) -> Likeness:
-    """Compare EVENT with the recorded events between the first and the last frame at these times [us]."""
+    """Compare EVENT with the recorded events, both between the first and the last frame time [us]."""
     trains = trains_of(events, shape[1])
     same = np.diff(trains.pixel) == 0
     lasted = np.diff(trains.t_us)[same] * 1e-3

@@ -1,9 +1,8 @@
-"""Leakage and shot noise of pixels whose light rests: the rates with which the simulated pixel does the same.
+"""Estimate leakage and shot noise from pixels under constant light, by matching simulated event rates.
 
-Of a still pixel leakage makes ON events, shot noise ON and OFF in turns, and a refractory period or
-thresholds that differ change how much of both is seen. So both rates are found together: pixels under the
-same light are simulated, and the rates changed until their ON and OFF events are as frequent as those of the
-recording.
+In a still pixel leakage causes ON events, and shot noise alternating ON and OFF events. A refractory period
+or unequal thresholds change the observed rates of both. So both are estimated together: pixels are simulated
+under the same light, and leakage and shot noise adjusted until the ON and OFF rates match the recording.
 """
 
 import dataclasses
@@ -17,21 +16,21 @@ from envs.events.pixel_noise import SHOT_NOISE_FALL
 from jobs.tools.calibrate.footage import Footage, Trains, simulate, trains_of
 from jobs.tools.calibrate.found import Found, neither
 
-BURN_IN = 0.25  # of the time: levels are where noise takes them only after a while
+BURN_IN = 0.25  # share of the time to skip, until noise has distributed the pixels' levels
 FEWEST_PIXELS = 16
 SIMULATED_PIXELS = 5000
 ROUNDS, NUDGE = 3, 0.2
 LEAST_NUDGE_HZ = 0.01
-HIDDEN = 1e-3  # of the slopes' determinant
+HIDDEN = 1e-3  # smallest determinant of the slopes that allows a solution
 STEP_US = 250_000
 
 
 class Rates(NamedTuple):
-    """ON and OFF events of a still pixel per second [Hz], and how uncertain they are.
+    """Rates of ON and OFF events of a still pixel, with their uncertainty.
 
     Attributes:
-        mean: float64 (2,).
-        covariance: Of the mean, float64 (2, 2).
+        mean: Mean rates, float64 (2,) [Hz].
+        covariance: Covariance of the means, float64 (2, 2) [Hz^2].
     """
 
     mean: np.ndarray
@@ -49,7 +48,7 @@ def still_rates(trains: Trains, still: np.ndarray, span_us: tuple[int, int]) -> 
         ]
     )
     seconds = (span_us[1] - begin) * 1e-6
-    # That of one event at least.
+    # At least the variance of a single event.
     covariance = (np.cov(counts) + np.eye(2) / counts.shape[1]) / counts.shape[1]
     return Rates(counts.mean(axis=1) / seconds, covariance / seconds**2)
 
@@ -57,7 +56,7 @@ def still_rates(trains: Trains, still: np.ndarray, span_us: tuple[int, int]) -> 
 def simulated_rates(
     leak_hz: float, shot_hz: float, camera: CameraConfig, luminance: float, span_us: tuple[int, int]
 ) -> Rates:
-    """Compute the rates of simulated pixels; equal arguments give equal numbers."""
+    """Compute the rates of simulated pixels; deterministic."""
     side = math.isqrt(SIMULATED_PIXELS)
     camera = dataclasses.replace(camera, width=side, height=side)
     times_us = np.append(np.arange(*span_us, STEP_US), span_us[1])
@@ -71,10 +70,10 @@ def simulated_rates(
 def noise_rates(
     seen: Rates, camera: CameraConfig, luminance: float, span_us: tuple[int, int]
 ) -> tuple[Found, Found]:
-    """`leak_hz` and `shot_noise_hz` [Hz] behind the rates of still pixels under a light, white = 1.
+    """Estimate `leak_hz` and `shot_noise_hz` [Hz] from rates of still pixels; luminance with white = 1.
 
-    The interval is that of the rates seen and of those simulated, through the slope of one against
-    the other.
+    The intervals combine the uncertainties of observed and simulated rates, propagated through the slopes of
+    the rates against leakage and shot noise.
     """
     ratio = (camera.contrast_threshold_off or camera.contrast_threshold) / camera.contrast_threshold
     on, off = seen.mean

@@ -1,4 +1,4 @@
-"""A recording and the frames beside it, as files have them."""
+"""Read a recording and its frames from files."""
 
 import dataclasses
 import struct
@@ -16,29 +16,29 @@ from jobs.run.recordings import read_recording
 from jobs.tools.calibrate.footage import Footage
 
 MAX_PIXELS = 1 << 28  # of all frames together: 1 GiB
-EIGHT_BITS = ("L", "LA", "P", "RGB", "RGBA")  # of Pillow's modes
-# What Pillow raises of files that are damaged, or too large to be decoded.
+EIGHT_BITS = ("L", "LA", "P", "RGB", "RGBA")  # Pillow's modes with 8 bits a value
+# Errors that Pillow raises for files that are damaged, or too large to decode.
 BROKEN = (OSError, SyntaxError, ValueError, struct.error, Image.DecompressionBombError)
 
 
 def read_frames(path: str | Path, delay_us: int) -> Footage:
-    """Frames named by a text file with a line "seconds picture" each, as Mueggler et al. (2017) have them.
+    """Read frames listed in a text file, one line "seconds picture" each, as in Mueggler et al. (2017).
 
     Pictures have 8 bits and are decoded from sRGB, which fits the frames of a DAVIS best (docs/camera.md).
 
     Args:
-        path: The text file; pictures are beside it.
-        delay_us: From the time of a frame to the light that it shows, half of its exposure [us].
+        path: The text file; paths of pictures are relative to its folder.
+        delay_us: Delay from the time of a frame to the middle of its exposure [us].
 
     Raises:
-        ValueError: A line, a picture or a time is not as it should be, or there are fewer than two frames.
+        ValueError: A line, a picture or a time is invalid, or there are fewer than two frames.
     """
     greys, times_us = read_greys(path), _frame_rows(Path(path))[0] + delay_us
     return Footage(light_of_grey("srgb")[greys], times_us)
 
 
 def read_greys(path: str | Path) -> np.ndarray:
-    """Read the pictures of such a text file, uint8 (K, H, W); raises as `read_frames`."""
+    """Read the pictures listed in a text file, uint8 (K, H, W); arguments and errors as in `read_frames`."""
     path, left, pictures = Path(path), MAX_PIXELS, []
     for name in _frame_rows(path)[1]:
         pictures.append(_picture(path.parent / name, left))
@@ -49,7 +49,7 @@ def read_greys(path: str | Path) -> np.ndarray:
 
 
 def _frame_rows(path: Path) -> tuple[np.ndarray, list[str]]:
-    """Read times [us], int64 (K,), and names of the pictures."""
+    """Read the times [us], int64 (K,), and the names of the pictures."""
     rows = [line.split() for line in path.read_text().splitlines() if line.strip() and line[0] != "#"]
     if len(rows) < 2 or any(len(row) != 2 for row in rows):
         raise ValueError(f'{path}: must have a line "seconds picture" for each of two frames or more')
@@ -63,7 +63,7 @@ def _frame_rows(path: Path) -> tuple[np.ndarray, list[str]]:
 
 
 def _picture(path: Path, left: int) -> np.ndarray:
-    """Greys of a picture of so many pixels at most, uint8 (H, W)."""
+    """Read a picture of at most `left` pixels as grey values, uint8 (H, W)."""
     try:
         with Image.open(path) as picture:
             unfit = _unfit(picture, left)
@@ -78,7 +78,7 @@ def _picture(path: Path, left: int) -> np.ndarray:
 
 
 def _unfit(picture: Image.Image, left: int) -> str:
-    """Why a picture is refused by its header, before it takes memory; empty: it is not."""
+    """Return why a picture is rejected by its header, before decoding; "" if it is valid."""
     if picture.mode not in EIGHT_BITS:
         return f"must have 8 bits a value, got mode {picture.mode}; convert it to a grey picture of 8 bits"
     width, height = picture.size
@@ -91,16 +91,16 @@ def _unfit(picture: Image.Image, left: int) -> str:
 
 
 def read_source(path: str | Path, frames: Footage | None, settings: RecordingConfig) -> EventFile:
-    """Return the events of a file of any format; what it does not say, `recording.*` and the frames do.
+    """Read the events of a file of any format; `recording.*` and the frames supply facts that it lacks.
 
     Raises:
-        ValueError: The file is refused, does not say its sensor's size where there are no frames, or has
-            another than these.
+        ValueError: The file is invalid, lacks its sensor's size if there are no frames, or has another size
+            than the frames.
     """
     size = dict(zip(("height", "width"), frames.luminance.shape[1:], strict=True)) if frames else {}
     found = read_recording(path, settings)
     if frames is not None and (found.height, found.width) == (None, None):
-        return read_recording(path, dataclasses.replace(settings, **size))  # refuses events outside
+        return read_recording(path, dataclasses.replace(settings, **size))  # raises for events outside
     if frames is None and None in (found.height, found.width):
         raise ValueError(f"{path}: does not say its sensor's size; give width and height")
     if frames is not None and (found.height, found.width) != frames.luminance.shape[1:]:
@@ -113,15 +113,15 @@ def read_source(path: str | Path, frames: Footage | None, settings: RecordingCon
 
 
 def frames_beside(path: str | Path, delay_us: int, settings: RecordingConfig) -> Footage | None:
-    """Return the frames in the event file itself, if it has some.
+    """Read the frames stored in the event file itself; None if it has fewer than two.
 
     Args:
         path: The event file, such as an AEDAT 4 file of a DAVIS.
-        delay_us: As in `read_frames`, for files that do not say the exposure.
-        settings: What the file does not say.
+        delay_us: As in `read_frames`, for files without exposure times.
+        settings: Supplies the group and the span of time to read.
 
     Raises:
-        ValueError: They are damaged, or too many.
+        ValueError: The frames are damaged, or have more than `MAX_PIXELS` pixels together.
     """
     if not has_frames(path):
         return None

@@ -1,10 +1,10 @@
-"""Contrast thresholds from counts of events against the light of frames.
+"""Estimate contrast thresholds from counts of events and the light of frames.
 
-Right after an event a pixel's response is the level that it remembers, and that level is a staircase: the
-response at the k-th event is c + on * (ON events so far) - off * (OFF events so far). Both thresholds come
-from the events of a pixel, sixteen at a time, so that what drifts slowly (leakage) does not count. The counts
-are uncertain, because noise fires events too; so the equations are not those of least squares but use the
-frames alone as instruments: the response, and how far it has risen.
+Right after an event a pixel's response is its remembered level, and this level is a staircase: the response
+at the k-th event is c + on * (ON events so far) - off * (OFF events so far). Both thresholds are estimated
+from runs of sixteen events of a pixel, so that slow drift (leakage) has no effect. The counts are uncertain,
+because noise causes events too. So the equations are not least squares; they use instrumental variables from
+the frames alone: the response, and the sum of its rises.
 """
 
 from typing import NamedTuple
@@ -15,23 +15,23 @@ from jobs.analysis.statistics import CONFIDENCE
 from jobs.tools.calibrate.footage import Light, Trains, looked_up
 from jobs.tools.calibrate.found import TAILS, Found, at_most, missing, neither, resampled, with_interval
 
-RUN = 16  # events of a pixel that are compared with each other
-FEWEST_EVENTS = 200  # in all runs of three or more
-FEWEST_IN_HALF = 24  # of a pixel, for its own thresholds
-HIGHEST = 10.0  # that a camera may have (envs.config.CameraConfig)
-NEGLIGIBLE = 1e-3  # mismatch, that of rounding and less
-WIDEST = 1.0  # interval, as a share of the value: four standard errors
+RUN = 16  # consecutive events of a pixel that are compared with each other
+FEWEST_EVENTS = 200  # of all pixels together
+FEWEST_IN_HALF = 24  # events in each half of a pixel's runs, for its own thresholds
+HIGHEST = 10.0  # highest threshold of a camera (envs.config.CameraConfig)
+NEGLIGIBLE = 1e-3  # mismatch at the level of rounding
+WIDEST = 1.0  # widest interval, about four standard errors, as a share of the value
 
 
 class Stairs(NamedTuple):
-    """Events and the light at them, each less its mean in the event's run, float64 (N,).
+    """Events and the light at their times, each minus its mean over the event's run, float64 (N,).
 
     Attributes:
-        response: Of the pixel at the event.
-        on, off: Events until then, itself included.
-        rise: How far the response had risen until then.
-        polarity: Of the event.
-        half: 2 * (the pixel's number) + (whether its run is an odd one), int64 (N,).
+        response: Response of the pixel at the event.
+        on, off: Numbers of ON and OFF events so far, including this one.
+        rise: Sum of the rises of the response so far.
+        polarity: Polarity of the event.
+        half: 2 * (pixel number) + (1 if the event is in an odd run), int64 (N,).
     """
 
     response: np.ndarray
@@ -43,12 +43,12 @@ class Stairs(NamedTuple):
 
 
 class Equations(NamedTuple):
-    """Two equations for (on, off) of each pixel, from one half of its runs each.
+    """Two pairs of equations for (on, off) of each pixel, each pair from one half of its runs.
 
     Attributes:
-        matrix: float64 (2, P, 2, 2).
-        right: float64 (2, P, 2).
-        events: Events in them, float64 (2, P).
+        matrix: Coefficients: half, pixel, equation, unknown; float64 (2, P, 2, 2).
+        right: Right-hand sides, float64 (2, P, 2).
+        events: Number of events in each pair, float64 (2, P).
     """
 
     matrix: np.ndarray
@@ -59,8 +59,8 @@ class Equations(NamedTuple):
 def staircase(trains: Trains, light: Light, refractory_us: float) -> Stairs:
     """Return the events of P pixels as steps of staircases.
 
-    What the light did in a dead time is taken off the response: at its end a pixel takes the light of that
-    moment as its level.
+    Changes of the response during dead times are subtracted, because a pixel takes the light at the end of
+    its dead time as its level.
     """
     start = np.searchsorted(trains.pixel, trains.pixel)
     place = np.arange(trains.pixel.size) - start
@@ -90,7 +90,7 @@ def equations(trains: Trains, light: Light, refractory_us: float) -> Equations:
 
 
 def thresholds(found: Equations, rng: np.random.Generator) -> tuple[Found, Found]:
-    """ON and OFF threshold, of all pixels together; intervals over pixels."""
+    """Estimate the ON and OFF threshold of all pixels together, with intervals over pixels."""
     matrix, right = found.matrix.sum(axis=0), found.right.sum(axis=0)
     if found.events.sum() < FEWEST_EVENTS:
         return neither(f"fewer than {FEWEST_EVENTS} events between the frames")
@@ -104,7 +104,7 @@ def thresholds(found: Equations, rng: np.random.Generator) -> tuple[Found, Found
         return neither("too few pixels whose light changes")
     drawn = np.linalg.solve(drawn[sound], sums[sound][..., None])[..., 0]
     on, off = (with_interval(value[k], drawn[:, k]) for k in range(2))
-    # Frames of another scene tell nothing of the counts: the solution is anything, and its interval wide.
+    # With frames of another scene the solution is arbitrary, and its interval wide.
     width = np.max((on.high - on.low, off.high - off.low) / value)
     if not (np.min((on.low, off.low)) > 0.0 and max(value) <= HIGHEST and width < WIDEST):
         return neither(
@@ -114,7 +114,7 @@ def thresholds(found: Equations, rng: np.random.Generator) -> tuple[Found, Found
 
 
 def is_singular(matrix: np.ndarray) -> np.ndarray:
-    """Tell which of the equations, (..., 2, 2), have no unique solution; bool (...)."""
+    """Test which of the equations, (..., 2, 2), have no unique solution; bool (...)."""
     determinant = matrix[..., 0, 0] * matrix[..., 1, 1] - matrix[..., 0, 1] * matrix[..., 1, 0]
     return ~(np.abs(determinant) > 1e-9 * np.square(matrix).sum(axis=(-2, -1)))
 
@@ -122,9 +122,9 @@ def is_singular(matrix: np.ndarray) -> np.ndarray:
 def mismatch(found: Equations, values: tuple[float, float], rng: np.random.Generator) -> Found:
     """Compute the standard deviation of the thresholds over pixels, as a share of the mean.
 
-    A pixel's thresholds are found twice, from halves of its runs. What is the same in both is the pixel,
-    what differs is chance: the covariance of the two is the variance over pixels. Where that may as well be
-    none, only the most that it can be is said.
+    Each pixel's thresholds are estimated twice, from the two halves of its runs. The pixel's own deviation is
+    common to both, while chance is not: so the covariance of the two is the variance over pixels. If the
+    mismatch may be 0, only an upper limit is returned.
     """
     good = (found.events >= FEWEST_IN_HALF).all(axis=0)
     matrix = found.matrix[:, good]
@@ -141,7 +141,7 @@ def mismatch(found: Equations, values: tuple[float, float], rng: np.random.Gener
     deviations = share - share.mean(axis=1, keepdims=True)
     variance = float((deviations[0] * deviations[1]).mean())
     low, high = np.quantile(drawn, TAILS)
-    if not low > NEGLIGIBLE**2:  # widened as a value that is corrected would be
+    if not low > NEGLIGIBLE**2:  # widened like a corrected value
         return at_most(float(np.sqrt(max(variance, 0.0) + 2**0.5 * (high - variance))))
     if variance > 1.0:
         return missing("frames and events do not fit each other: thresholds differ by more than their mean")

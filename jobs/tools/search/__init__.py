@@ -1,1 +1,1 @@
-"""Searching for settings: the space, a trial, and the search."""
+"""Search for settings: the space, a trial, and the search."""

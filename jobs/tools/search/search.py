@@ -1,10 +1,10 @@
 """Search for settings that a training learns best with (Optuna's TPE; ASHA: Li et al. 2020).
 
 Run: python -m platform.launch +exp=search model=event_columns
-Expect: trials as trainings on one core each, side by side on all; in the run folder under `tune-HASH/` every
-measurement, a figure of all curves and a table; in MLflow a child run for each trial. All are measured in
-the same validation corridors, in which nothing is trained or evaluated. The same command continues a stopped
-search.
+Expect: each trial is a training on one core; trials run in parallel on all cores. In the run folder under
+`tune-HASH/`: every measurement, a figure of all curves and a table; in MLflow a child run for each trial. All
+trials are measured in the same validation corridors, which training and evaluation do not use. To resume a
+stopped search, run the same command again.
 """
 
 import dataclasses
@@ -49,21 +49,21 @@ from jobs.training.inputs import check_inputs, prepare_inputs
 from jobs.training.train import TrainingError, can_continue, relayed_to, run_config, stopped
 from models.policy.policy import ENCODER_FILES, NETWORKS
 
-REDUCTION = 3  # of the trials that reach a step of ASHA, one in so many goes on
-METRIC = "distance_m"  # success is 0 for long, and would tell nothing early
+REDUCTION = 3  # one in so many trials continues beyond each rung of ASHA
+METRIC = "distance_m"  # success stays 0 for long, and cannot rank trials early
 HEADINGS = ("trial", "settings", "steps", "distance [m]", "success [%]")
 Row = dict[str, Any]  # one measurement: trial, env_steps, settings, distance_m, success_rate, metrics
 
 
 @dataclass(frozen=True, config=STRICT)
 class Settings:
-    """Which settings are searched, and how much each trial of some may cost.
+    """The settings to search, and the budget of the trials.
 
     Attributes:
         space: Key -> a list of values, or a range as in `jobs.config.conditions`.
-        trials: Trainings that are begun; most are stopped early.
-        report_steps: Environment steps between two measurements; the first is the earliest end of a trial.
-        episodes: Validation corridors of a measurement.
+        trials: Number of trainings to start; most are stopped early.
+        report_steps: Environment steps between measurements; no trial is stopped before the first one.
+        episodes: Validation corridors of each measurement.
     """
 
     space: Annotated[dict[str, Searched], Field(min_length=1)]
@@ -73,11 +73,11 @@ class Settings:
 
 
 def run(config: Config) -> dict[str, float]:
-    """Search, from where it stopped if it did; return the best trial's measurement.
+    """Run or resume the search; return the best trial's measurement.
 
     Raises:
-        ConfigError: A key cannot be searched, or one of its values would be refused.
-        TrainingError: No trial got as far as a measurement.
+        ConfigError: A key cannot be searched, or one of its values is invalid.
+        TrainingError: No trial reached a measurement.
     """
     errors = list(dict.fromkeys(space_errors(locate_run(config).config)))
     if errors:
@@ -98,7 +98,10 @@ def run(config: Config) -> dict[str, float]:
 
 
 def _inputs(folder: Run, tracker: Tracker) -> Files:
-    """Return the encoder that trials share, unless each has its own; the policy that they begin from."""
+    """Return name -> content of the shared encoder, if there is one, and of the initial policy, if any.
+
+    If the space changes the encoder, the result is empty, and each trial trains its own encoder.
+    """
     config = folder.config
     facts = encoder_facts(config)
     points = [{key: value} for key, values in config.own.space.items() for value in extremes(values)]
@@ -112,12 +115,12 @@ def _inputs(folder: Run, tracker: Tracker) -> Files:
 
 
 def place_name(own: Settings) -> str:
-    """Return the folder of a search in its run folder; the name is from when the job was called tune."""
+    """Return the name of a search's folder in its run folder; "tune" is an earlier name of the job."""
     return f"tune-{settings_hash(dataclasses.asdict(own))[:8]}"
 
 
 class Earlier(NamedTuple):
-    """A finished search for the same, of fewer trials, which this one continues."""
+    """A finished search with fewer trials and otherwise equal settings, which this search continues."""
 
     trials: int = 0
     rows: Sequence[Row] = ()
@@ -127,7 +130,7 @@ NOTHING_YET = Earlier()
 
 
 def earlier_trials(folder: Run, own: Settings) -> Earlier:
-    """Return the largest finished search of fewer trials that differs in nothing else."""
+    """Return the largest finished search with fewer trials and otherwise equal settings."""
     for trials in range(own.trials - 1, 0, -1):
         name = place_name(dataclasses.replace(own, trials=trials))
         file = folder.path / name / "results.jsonl"
@@ -139,7 +142,7 @@ def earlier_trials(folder: Run, own: Settings) -> Earlier:
 def search(
     config: Config, place: Path, files: Files, tracker: Tracker, begun: Earlier = NOTHING_YET
 ) -> list[Row]:
-    """Run the missing trials; return every measurement of all trials, in the order of their arrival."""
+    """Run the missing trials; return all measurements of all trials, in order of arrival."""
     start_ray(config.cluster, place.parent)
     place.mkdir(exist_ok=True)
     file = place / "results.jsonl"
@@ -169,7 +172,7 @@ def search(
 
 
 def _tuner(config: Config, place: Path, files: Files, begun: Earlier) -> tune.Tuner:
-    """Return the search in its folder: continued if it is there, else new."""
+    """Return Tune's search: restored if the folder has one, else new."""
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     path, most = storage(config.cluster, place), config.train.env_steps
     trial = tune.with_resources(tune.with_parameters(SearchTrial, base=config, files=files), {"cpu": 1})
@@ -196,7 +199,7 @@ def _tuner(config: Config, place: Path, files: Files, begun: Earlier) -> tune.Tu
 
 
 def _optuna(config: Config, begun: Earlier) -> OptunaSearch:
-    """Return Optuna's search, which knows the last measurement of each earlier trial and proposes others."""
+    """Return Optuna's search, initialized with the last measurement of each earlier trial."""
     last = {row["trial"]: row for row in begun.rows}.values()
     if not last:
         return OptunaSearch(seed=config.seed)
@@ -208,18 +211,18 @@ def _optuna(config: Config, begun: Earlier) -> OptunaSearch:
 
 
 def measurement(result: Mapping[str, Any]) -> Row:
-    """Return the stored part of a result of Tune's."""
+    """Return the part of a Tune result to store."""
     kept = {name: result[name] for name in ("env_steps", "distance_m", "success_rate", "metrics")}
     return {"trial": result["trial_id"], "settings": read_settings(result["config"]), **kept}
 
 
 def of_trial(rows: Sequence[Row], trial: str) -> list[Row]:
-    """Return the measurements of one trial, by steps."""
+    """Return the measurements of one trial, sorted by steps."""
     return sorted((row for row in rows if row["trial"] == trial), key=lambda row: row["env_steps"])
 
 
 def ranked(rows: Sequence[Row]) -> list[Row]:
-    """Return the last measurement of each trial, by trained steps, then by result, highest first."""
+    """Return the last measurement of each trial, sorted by trained steps, then by distance, highest first."""
     last = [of_trial(rows, trial)[-1] for trial in dict.fromkeys(row["trial"] for row in rows)]
     return sorted(last, key=lambda row: (row["env_steps"], row["distance_m"]), reverse=True)
 
@@ -231,7 +234,7 @@ def child_run(rows: Sequence[Row]) -> ChildRun:
         curves[f"tune/{name}"] = {row["env_steps"]: row[name] for row in rows}
     for name in rows[-1]["metrics"]:
         curves[name] = {row["env_steps"]: row["metrics"][name] for row in rows if name in row["metrics"]}
-    # Parameters are texts, which MLflow sorts as such: numbers are metrics too.
+    # MLflow sorts parameters as text, so numbers are logged as metrics too.
     numbers = {
         f"tune/{key}": float(value)
         for key, value in settings.items()
@@ -242,7 +245,7 @@ def child_run(rows: Sequence[Row]) -> ChildRun:
 
 
 def words(settings: Mapping[str, Any]) -> str:
-    """Return settings as words of a command line."""
+    """Return settings as arguments of a command line."""
     texts = {
         key: f"{value:.4g}" if isinstance(value, float) else str(value) for key, value in settings.items()
     }

@@ -1,4 +1,4 @@
-"""The space of a search: which settings may be tried, and a configuration with some of them."""
+"""The space of a search: convert it for Tune, check it, and build the configurations of trials."""
 
 import copy
 import dataclasses
@@ -14,14 +14,14 @@ from jobs.run.identity import TRAINED_BY
 from jobs.training.pretrain import evae_settings
 from models.kinds import KINDS
 
-# What a search is called, and what all its trials must have in common to be compared; what is no part of a
-# training is no part of a trial either.
+# Keys that cannot be searched: names, settings that do not affect a training, and settings that must be equal
+# for trials to be comparable.
 FIXED = {*fields_of(Config), "search", "exp", "budget"} - ({*TRAINED_BY} - {"exp", "budget"})
 FIXED_KEYS = ("train.env_steps", "algo.num_env_runners", "algo.lr_schedule")
 
 
 def search_space(space: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the space for Tune; values that are lists travel as JSON, so that a list may be one value."""
+    """Return the space for Tune; listed values are encoded as JSON, so that a value may itself be a list."""
     return {key: _domain(values) for key, values in space.items()}
 
 
@@ -35,22 +35,22 @@ def _domain(values: Any) -> Any:
 
 
 def sampled(settings: Mapping[str, Any], space: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings of a trial as Tune draws them; the inverse of `read_settings`."""
+    """Encode the settings of a trial as Tune draws them; the inverse of `read_settings`."""
     return {
         key: json.dumps(value) if isinstance(space[key], list) else value for key, value in settings.items()
     }
 
 
 def read_settings(sampled: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings of a trial, from what Tune has drawn."""
+    """Decode the settings of a trial that Tune has drawn."""
     return {key: json.loads(value) if isinstance(value, str) else value for key, value in sampled.items()}
 
 
 def with_settings(config: Config, settings: Mapping[str, Any]) -> Config:
-    """Return the configuration of a trial: with some settings replaced, and all work in one process.
+    """Return the configuration of a trial: some settings replaced, without additional processes.
 
     Raises:
-        ConfigError: One is unknown, or its value is refused.
+        ConfigError: A setting is unknown, or its value is invalid.
     """
     values: dict[str, Any] = copy.deepcopy(as_dict(config))
     values["algo"]["num_env_runners"] = 0
@@ -66,7 +66,7 @@ def with_settings(config: Config, settings: Mapping[str, Any]) -> Config:
 
 
 def space_errors(config: Config) -> Iterator[str]:
-    """Return one line for each key that cannot be searched, and for each value that would be refused."""
+    """Yield one line for each key that cannot be searched, and for each invalid value."""
     for key, values in config.own.space.items():
         if key.partition(".")[0] in FIXED or key in FIXED_KEYS:
             yield f"search.space: {key} must be the same for all trials"
@@ -79,12 +79,15 @@ def space_errors(config: Config) -> Iterator[str]:
 
 
 def extremes(values: Any) -> list[Any]:
-    """Return all values of a list, the ends of a range."""
+    """Return all values of a list, or the ends of a range."""
     return values if isinstance(values, list) else [values["low"], values["high"]]
 
 
 def encoder_facts(config: Config) -> dict[str, Any] | None:
-    """Return what determines a frozen encoder; trials with equal facts share one; None without an encoder."""
+    """Return the settings that determine a frozen encoder; None if the model has none.
+
+    Trials with equal settings share an encoder.
+    """
     if not KINDS[config.model.name].encoder:
         return None
     parts = {name: dataclasses.asdict(getattr(config, name)) for name in ("collect", "pretrain")}

@@ -1,4 +1,4 @@
-"""One trial of a search: a training in one process, measured in validation corridors as it goes on."""
+"""One trial of a search: a training in one process, measured regularly in validation corridors."""
 
 import dataclasses
 import math
@@ -23,14 +23,14 @@ from jobs.training.trainable import Trainable
 from models.policy.policy import ENCODER, NETWORKS
 
 PROGRESS = "trial.json"  # in a checkpoint
-NOT_FINITE = "finite"  # in what a training says that has diverged
-SIDE_BY_SIDE = 8  # episodes of a measurement
+NOT_FINITE = "finite"  # part of the error message of a diverged training
+SIDE_BY_SIDE = 8  # parallel episodes of a measurement
 
-Files = Mapping[str, bytes]  # name -> content, for machines that do not see the driver's folders
+Files = Mapping[str, bytes]  # name -> content, for machines without access to the driver's folders
 
 
 class Unrecorded:
-    """A tracker that records nothing: only the driver writes."""
+    """A tracker that records nothing, because only the driver writes to the tracking store."""
 
     def __getattr__(self, name: str) -> Any:
         """Return a function that does nothing."""
@@ -38,16 +38,16 @@ class Unrecorded:
 
 
 class SearchTrial(Trainable):
-    """Trains with some settings; each step of it ends with a measurement."""
+    """A training with the drawn settings; each of its steps ends with a measurement."""
 
     @torch_threads(1)
     def setup(self, config: dict[str, Any], base: Config, files: Files) -> None:
         """Build the training.
 
         Args:
-            config: The settings, as Tune has drawn them.
-            base: The experiment that they change.
-            files: An encoder to share or a policy to begin from, by name; empty: there is none.
+            config: The settings as Tune has drawn them.
+            base: The experiment that these settings change.
+            files: Files of the shared encoder and of the initial policy, if there are any.
         """
         drop_unfinished(self.checkpoints())
         self._steps, self._experiment = 0, with_settings(base, read_settings(config))
@@ -66,7 +66,7 @@ class SearchTrial(Trainable):
 
     @torch_threads(1)
     def step(self) -> dict[str, Any]:
-        """Train up to the next measurement, and measure; a training that has diverged ends at 0 m."""
+        """Train up to the next measurement, and measure; a diverged training ends with 0 m."""
         asked = self._experiment
         until = min(self._steps + asked.own.report_steps, asked.train.env_steps)
         metrics: dict[str, float] = {}
@@ -88,7 +88,7 @@ class SearchTrial(Trainable):
         return {"env_steps": self._steps, **figures, "metrics": metrics, "done": done}
 
     def measured(self) -> dict[str, float]:
-        """Evaluate the policy in validation corridors, which neither training nor evaluation uses."""
+        """Evaluate the policy in validation corridors, which training and evaluation do not use."""
         asked = self._experiment
         env = dataclasses.replace(asked.env, split="validation")
         with unfinished(self.checkpoints()) as folder:
@@ -101,16 +101,16 @@ class SearchTrial(Trainable):
         return {name: float(values.mean()) for name, values in means}
 
     def save_checkpoint(self, checkpoint_dir: str) -> None:
-        """Write what the future of the training depends on."""
+        """Write the state of the training."""
         Path(checkpoint_dir).mkdir(exist_ok=True)
         self._training.save_checkpoint(checkpoint_dir)
         write_json(Path(checkpoint_dir) / PROGRESS, {"env_steps": self._steps})
 
     def load_checkpoint(self, checkpoint: Any) -> None:
-        """Go on from it."""
+        """Continue from a checkpoint."""
         self._training.load_checkpoint(checkpoint)
         self._steps = int(read_json(Path(checkpoint) / PROGRESS)["env_steps"])
 
     def cleanup(self) -> None:
-        """Let go of the training."""
+        """Stop the training and free its resources."""
         self._training.stop()

@@ -1,4 +1,4 @@
-"""Env runners of imitation: the student flies, the teacher labels every step and acts in some."""
+"""Env runners of imitation: the student acts; the teacher labels every step and acts in some of them."""
 
 from typing import Any
 
@@ -9,11 +9,11 @@ from jobs.training.imitation.labelled_steps import COSTS, MIRRORED, SETTINGS, mi
 from jobs.training.sampling.snapshots import Snapshot
 from jobs.training.sampling.teacher import TeacherEnvRunner
 
-MIRROR = np.array([-1.0, 1.0])  # of a velocity to the right and ahead
+MIRROR = np.array([-1.0, 1.0])  # factors of a velocity (right, ahead) if left and right are exchanged
 
 
 class TaughtEnvRunner(TeacherEnvRunner):
-    """A `PlainEnvRunner` whose steps carry the teacher's costs, and its mirror image if asked for."""
+    """A `PlainEnvRunner` whose steps have the teacher's costs and, with mirroring, a mirrored observation."""
 
     @property
     def _settings(self) -> Any:
@@ -26,7 +26,7 @@ class TaughtEnvRunner(TeacherEnvRunner):
         return 0.5**done if done < self._settings["guided_batches"] else 0.0
 
     def snapshot(self) -> Snapshot:
-        """Return the state of `PlainEnvRunner.snapshot`, and the mirrored observations."""
+        """Return the snapshot of `PlainEnvRunner`, with any mirrored observations."""
         snapshot = super().snapshot()
         if self._settings.get(MIRRORED) and "stacks" in snapshot.arrays:
             snapshot.arrays[MIRRORED] = self._mirrored

@@ -13,36 +13,36 @@ from jobs.training.ppo.losses import STARTS, TAKEN
 from jobs.training.sampling.env_runner import STATES
 
 SETTINGS = "imitation"  # key among the learner's settings: the fields of `ImitationConfig`, and env_steps
-COSTS = "costs"  # column of a step: cost of each action minus that of the cheapest, float32 (actions,)
+COSTS = "costs"  # column of a step: cost of each action minus the lowest cost, float32 (actions,)
 MIRRORED = "mirrored"  # column of a step: its observation with left and right exchanged
 NAMES = {"stacks": Columns.OBS, "costs": COSTS, "taken": TAKEN}  # stored name -> column that the loss reads
 
 
 def mirror_images(settings: Mapping[str, Any]) -> list[int]:
-    """Return the mirrored action of each action, from the learner's settings; none if nothing is mirrored."""
-    mirrored = settings.get(MIRRORED, False)  # True: of the kinematic vehicle; a list: of another one
+    """Return the mirror image of each action, from the learner's settings; empty without mirroring."""
+    mirrored = settings.get(MIRRORED, False)  # True for the kinematic vehicle, a list for another
     return MIRRORED_ACTIONS if mirrored is True else list(mirrored or [])
 
 
 def windows(rows: Mapping[str, Tensor], before: int, most: int) -> dict[str, Tensor]:
-    """Cut rows of successive steps into windows that a recurrent network reads from the state zero.
+    """Cut rows of successive steps into windows that a recurrent network reads from a zero state.
 
-    A window has up to `before` steps that only lead to the state, and up to `most` that are learnt from.
-    Steps that fewer precede in their piece of an episode are left out, unless the episode begins with it.
+    A window has up to `before` warm-up steps, which only build up the state, then up to `most` steps to learn
+    from. A window with fewer warm-up steps is dropped, unless its piece is the start of an episode.
 
     Args:
-        rows: Columns (N, ...), among them `STARTS`; and of the states before each step, `STATES`.
-        before: Steps.
-        most: Steps.
+        rows: Columns (N, ...), among them `STARTS`, and `STATES`, the state before each step.
+        before: Most warm-up steps of a window.
+        most: Most steps to learn from in a window.
 
     Returns:
-        Columns (C, before + most, ...) but the states, and `TAKEN`, of the steps that are learnt from.
+        Columns (C, before + most, ...) without `STATES`, and `TAKEN`, True for the steps to learn from.
     """
     steps, states = rows[STARTS], rows[STATES]
     first = torch.nonzero(steps % most == 0)[:, 0]
     ends = torch.cat([first[1:], torch.tensor([len(steps)])])
     piece = first - steps[first]
-    known = ~states[piece].any(1) | (steps[first] >= before)  # only at the start of an episode is it zero
+    known = ~states[piece].any(1) | (steps[first] >= before)  # zero only at an episode's start
     first, ends, piece = first[known], ends[known], piece[known]
     places = torch.maximum(first - before, piece)[:, None] + torch.arange(before + most)
     taken = (places >= first[:, None]) & (places < ends[:, None])
@@ -51,7 +51,7 @@ def windows(rows: Mapping[str, Tensor], before: int, most: int) -> dict[str, Ten
 
 
 class LabelledSteps:
-    """Steps with their labels, of all batches; beyond a bound, a uniform random sample of them.
+    """Labelled steps of all batches; beyond a memory bound, a uniform random sample of them.
 
     A row is a step, or a window of steps for a recurrent network.
     """
@@ -64,9 +64,9 @@ class LabelledSteps:
         return min(self.seen, self._room)
 
     def add(self, **columns: np.ndarray) -> None:
-        """Add rows: stacks (N, ...), costs (N, ..., actions), of windows taken (N, T).
+        """Add rows: stacks (N, ...), costs (N, ..., actions) and, for windows, taken (N, T).
 
-        Each row so far has the same chance to stay.
+        Beyond the bound, all rows so far have the same chance to stay (reservoir sampling).
         """
         if not self.seen:
             self._allocate(columns)

@@ -1,15 +1,15 @@
 """The learner of imitation (DAgger: Ross et al. 2011).
 
-The env runners fly the student, in the first batches mixed with the teacher. The teacher labels every
-step with the cost of each action, also where the student strayed. The learner stores all steps, and after
-each batch fits the policy's networks to the labels. After the last batch it restarts from the initial
+The student acts in the env runners; in the first batches the teacher acts in some steps. The teacher labels
+every step with the cost of each action, also where the student strayed. The learner stores all steps, and
+after each batch fits the policy's networks to the labels. After the last batch it restarts from the initial
 weights: networks that first learnt from few corridors generalise worse than networks that see all
-corridors from the start (Ash and Adams 2020). The value network learns nothing.
+corridors from the start (Ash and Adams 2020). The value network is not trained.
 
 With mirroring, each step is stored a second time with left and right exchanged, observation and label.
 
-A recurrent network learns from windows of steps (`labelled_steps.windows`). Each begins with the state zero,
-not with that in which the env runner acted: after the last batch the networks that made those are gone.
+A recurrent network learns from windows of steps (`labelled_steps.windows`). Each starts from a zero state,
+not from the state in which the env runner acted: that state came from weights that are later replaced.
 """
 
 import copy
@@ -44,9 +44,9 @@ AGREEMENT_KEY = "agreement"
 
 
 def sequence_steps(config: Any) -> int:
-    """Return how many steps a recurrent network learns from at once, and how many lead to their state.
+    """Return a window's number of warm-up steps, which is also its number of steps to learn from.
 
-    At most half of the piece of an episode that a batch holds, whose first steps nothing leads to.
+    At most half of an episode's piece in a batch, because the first steps of a piece have no warm-up.
     """
     piece = config.train_batch_size_per_learner // (
         max(1, config.num_env_runners) * config.num_envs_per_env_runner
@@ -66,7 +66,7 @@ class ImitationLearner(PlainPPOLearner):
         self._first = copy.deepcopy(self.module[DEFAULT_MODULE_ID].unwrapped().state_dict())
 
     def update(self, *, timesteps: Mapping[str, int] | None = None, **asked: Any) -> Any:
-        """Fit to all steps so far, longer after the last batch; arguments and result as of PPO's learner."""
+        """Fit to all steps so far, longer after the last batch; arguments and result as in PPO's learner."""
         sampled = dict(timesteps or {}).get(NUM_ENV_STEPS_SAMPLED_LIFETIME, 0)
         self._last = sampled >= self._settings["env_steps"]
         return super().update(timesteps=timesteps, **asked)
@@ -97,7 +97,7 @@ class ImitationLearner(PlainPPOLearner):
         return {name: torch.from_numpy(np.concatenate(parts)) for name, parts in columns.items()}
 
     def _improve(self, rows: dict[str, Tensor], num_epochs: int, minibatch_size: int) -> dict[str, Any]:
-        """Take gradient steps on random rows of all steps so far; return the means of their figures."""
+        """Take gradient steps on random rows of all steps so far; return the means of their metrics."""
         likeliest, costs = rows[Columns.ACTION_DIST_INPUTS].argmax(1, keepdim=True), rows[COSTS]
         if self._policy.state_size:
             length = sequence_steps(self.config)
@@ -113,18 +113,18 @@ class ImitationLearner(PlainPPOLearner):
             if self._last:
                 optimizer.param_groups[0]["lr"] = self.config.lr * (1.0 - step / count)
             for name, figure in self._step(self._steps.draw(minibatch_size)).items():
-                # Into one array: a tensor kept for each step lies between the minibatches in memory, and the
-                # allocator then does not use their places again (gigabytes in 20,000 steps).
+                # One array: a tensor stored per step would lie between the minibatches in memory, and the
+                # allocator would not reuse their space (gigabytes in 20,000 steps).
                 if not step:
                     figures[name] = torch.empty(count)
                 figures[name][step] = figure
         if self._last:
-            self._steps = LabelledSteps(0)  # a checkpoint would hold them otherwise
+            self._steps = LabelledSteps(0)  # keeps the steps out of the last checkpoint
         means = {name: values.mean() for name, values in figures.items()}
         return means | {AGREEMENT_KEY: (costs.gather(1, likeliest) == 0.0).float().mean()}
 
     def _keep(self, rows: Mapping[str, Tensor]) -> None:
-        """Add rows to the stored ones, and their mirror images if asked for."""
+        """Store rows and, with mirroring, their mirror images."""
         own = {"taken": rows[TAKEN].numpy()} if TAKEN in rows else {}
         costs = rows[COSTS].numpy()
         self._steps.add(stacks=rows[Columns.OBS].numpy(), costs=costs, **own)

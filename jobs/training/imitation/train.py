@@ -1,4 +1,4 @@
-"""Imitation in RLlib's words: PPO's env runners and checkpoints, with another learner."""
+"""RLlib's configuration of imitation: PPO's env runners and checkpoints, with another learner."""
 
 import dataclasses
 from pathlib import Path
@@ -16,7 +16,7 @@ from jobs.training.ppo.train import PPO, Parts, build_of, shared_settings
 
 
 def build(config: Config, encoder_path: str | Path | None = None, init: Path | None = None) -> PPOConfig:
-    """Return RLlib's configuration of imitation; arguments and errors as of PPO's `build`."""
+    """Return RLlib's configuration of imitation; arguments and errors as in PPO's `build`."""
     algo = cast(AlgoConfig, config.algo)
     parts = Parts(TaughtEnvRunner, ImitationLearner, learner_settings(config), algo.lr)
     return build_of(parts, config, encoder_path, init)
@@ -26,7 +26,7 @@ def learner_settings(config: Config) -> dict[str, object]:
     """Return the settings of the imitation learner and its env runners."""
     algo = cast(AlgoConfig, config.algo)
     own = dataclasses.asdict(algo.imitation) if algo.imitation else {}
-    if algo.mirrored:  # only then: Tune resumes a training only under the keys that it began with
+    if algo.mirrored:  # only then: Tune resumes a training only with the keys with which it started
         kinematic = config.env.vehicle == "kinematic"
         own[MIRRORED] = True if kinematic else mirrored_actions(make_dynamics(config.env))
     return shared_settings(algo) | {SETTINGS: {**own, "env_steps": config.train.env_steps}}

@@ -1,1 +1,1 @@
-"""Proximal policy optimisation (Schulman et al. 2017): its loss, its learner, and how RLlib is configured."""
+"""Proximal policy optimisation (Schulman et al. 2017): loss, learner and RLlib's configuration."""

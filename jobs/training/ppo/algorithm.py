@@ -1,4 +1,4 @@
-"""RLlib's PPO in rounds of sampling, which ends with the same bytes whatever interrupts it."""
+"""RLlib's PPO in rounds of sampling; interruptions do not change a byte of its result."""
 
 from pathlib import Path
 from typing import Any
@@ -28,12 +28,12 @@ from jobs.training.sampling.snapshots import (
 from jobs.training.trainable import Guarded
 
 LEARNER = "learner"  # name of this process in a checkpoint
-NOTICE = "notice"  # key of a result: one line that the user has to know
+NOTICE = "notice"  # key of a result: one line for the user
 NEW_EPISODES = "Continues with new episodes, so its result will differ from an uninterrupted training"
 
 
 class PPO(Guarded, RLlibPPO):
-    """RLlib's PPO; its name is RLlib's, because Tune resumes a training only under its first name."""
+    """RLlib's PPO, under RLlib's name, because Tune resumes a training only under its first name."""
 
     _rounds: Any = None
 
@@ -47,7 +47,7 @@ class PPO(Guarded, RLlibPPO):
                 self._refused = error
 
     def save_checkpoint(self, checkpoint_dir: str) -> None:
-        """Write all that the future of the training depends on."""
+        """Write a checkpoint with all state on which the rest of the training depends."""
         super().save_checkpoint(checkpoint_dir)
         runners = {str(index): snapshot for index, snapshot in self._rounds.snapshots.items()}
         (answer,) = self.learner_group.foreach_learner(lambda learner: learner.own_state())
@@ -55,7 +55,7 @@ class PPO(Guarded, RLlibPPO):
         write_snapshots(Path(checkpoint_dir), {LEARNER: own, **runners})
 
     def load_checkpoint(self, checkpoint: Any) -> None:
-        """Resume from a checkpoint; the first iteration raises what could not be built or read."""
+        """Resume from a checkpoint; an error of building or reading is raised by the first iteration."""
         super().load_checkpoint(checkpoint)
         if self._refused is None:
             try:
@@ -64,10 +64,10 @@ class PPO(Guarded, RLlibPPO):
                 self._refused = error
 
     def _resume(self, found: dict[str, Snapshot] | None) -> None:
-        """Put every process where it was when the checkpoint was written.
+        """Restore the state of every process when the checkpoint was written.
 
         Raises:
-            RunError: The checkpoint has other processes.
+            RunError: The checkpoint is of other processes.
         """
         if found is None:
             self._rounds.problems.append("the checkpoint is of an earlier version, and does not hold the old")
@@ -111,7 +111,7 @@ class PPO(Guarded, RLlibPPO):
             )
 
     def step(self) -> Any:
-        """Run one iteration, and report why episodes had to be started again, if they had to."""
+        """Run one iteration; if episodes had to be restarted, report why."""
         result = super().step()
         if self._rounds.problems:
             result[NOTICE] = f"{NEW_EPISODES}: {self._rounds.problems.pop()}"

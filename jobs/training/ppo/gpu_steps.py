@@ -1,11 +1,11 @@
-"""A learner's gradient steps on a GPU, each a replay of one recorded step.
+"""Gradient steps of a learner on a GPU, each a replay of one recorded step.
 
-A step on 256 pictures takes 1.4 ms of an H200, and 70 ms of a core (docs/performance.md). It consists of
-many small kernels, which take longer to start one after the other than to run. So a step is recorded once as
-a CUDA graph, and all of an update are replays of it: weights, Adam's moments and the rows of an iteration
-travel to the GPU once an update, and what was learnt travels back. Arithmetic is float32 (the variable
-TORCH_ALLOW_TF32_CUBLAS_OVERRIDE would make products of matrices TF32), by algorithms that give the same
-digits each time on the same GPU.
+A step on 256 pictures takes 1.4 ms on an H200 and 70 ms on a CPU core (docs/performance.md). It consists of
+many small kernels, and launching them takes longer than running them. So one step is recorded as a CUDA
+graph, and all steps of an update replay it. Weights, Adam's moments and the rows of an iteration are copied
+to the GPU once per update, the new weights and moments back. Arithmetic is float32 (the environment variable
+TORCH_ALLOW_TF32_CUBLAS_OVERRIDE would make matrix products TF32), by algorithms that give the same digits
+each time on the same GPU.
 """
 
 import contextlib
@@ -17,19 +17,19 @@ import torch
 from torch import Tensor, nn
 
 Loss = Callable[[Any, dict[str, Tensor]], tuple[Tensor, dict[str, Tensor]]]
-TOTAL, NORM = "total", "norm"  # of what is reported of a step, beside the parts of its loss
+TOTAL, NORM = "total", "norm"  # names of a step's metrics, besides the parts of its loss
 MOMENTS = ("step", "exp_avg", "exp_avg_sq")
-ROOM = 256  # rows: iterations differ by a few, and a recorded step reads from where the rows lay
-WARM_UP = 3  # steps before one is recorded, in which libraries choose algorithms and allocate
+ROOM = 256  # rows, unit of allocation: iterations differ by a few, and recorded steps read fixed addresses
+WARM_UP = 3  # steps before the recording, in which libraries choose algorithms and allocate memory
 
 
 class Recorded(NamedTuple):
-    """One gradient step.
+    """One recorded gradient step.
 
     Attributes:
-        key: What it was recorded for.
+        key: Number of rows, gradient limit and variant of the loss for which it was recorded.
         graph: The step.
-        picked: int64 (B,), which rows the next replay learns from.
+        picked: int64 (B,), the rows from which the next replay learns.
     """
 
     key: Hashable
@@ -38,19 +38,19 @@ class Recorded(NamedTuple):
 
 
 class GpuSteps:
-    """Copies of a module and its optimiser on a device, which take the steps of an update there.
+    """Takes the gradient steps of an update on a device, with copies of a module and its optimiser.
 
-    Without a GPU (`device="cpu"`) no step is recorded, each is computed: for tests.
+    With `device="cpu"`, for tests, no step is recorded; each is computed.
     """
 
     def __init__(self, module: nn.Module, optimizer: torch.optim.Optimizer, loss: Loss, device: str) -> None:
-        """Make the copies.
+        """Copy the module and its optimiser to the device.
 
         Args:
-            module: An RLlib module with `compute_values`; its parameters are those that the optimiser has.
-            optimizer: Adam of its parameters.
-            loss: The loss of a minibatch and its named parts, computed by the module that it is given.
-            device: As torch names it.
+            module: An RLlib module with `compute_values`.
+            optimizer: Adam over all trainable parameters of the module.
+            loss: (module, rows of a minibatch) -> the loss and its named parts.
+            device: Name of a torch device.
         """
         self._device = torch.device(device)
         self._recording = self._device.type == "cuda"
@@ -72,7 +72,7 @@ class GpuSteps:
         self._recorded: Recorded | None = None
 
     def values(self, module: nn.Module, told: Mapping[str, Tensor]) -> Tensor:
-        """Compute `module.compute_values` on the device; return it on the processor, float32 (B,)."""
+        """Compute `module.compute_values` on the device; return the values on the CPU, float32 (B,)."""
         self._load_weights(module)
         with exact():
             return self._module.compute_values({name: self._there(part) for name, part in told.items()}).cpu()
@@ -90,20 +90,20 @@ class GpuSteps:
         """Take all steps of an update; module and optimiser change in place.
 
         Args:
-            module: As the one that this was made from.
-            optimizer: Adam of its parameters.
-            rows: What to learn from, each (N, ...).
+            module: A module with the same layers as the one in the constructor.
+            optimizer: Adam over the module's parameters.
+            rows: Columns to learn from, each (N, ...).
             orders: int64 (epochs, N), the order of the rows in each epoch.
-            minibatch_size: Rows of a step; the last of an epoch may have fewer.
+            minibatch_size: Rows of a step; the last step of an epoch may have fewer.
             grad_clip: Largest norm of a gradient.
-            variant: What the loss depends on beside its arguments: another one is recorded again.
+            variant: Other values on which the loss depends; if they change, the step is recorded again.
 
         Returns:
             Means over the minibatches of the last epoch: parts of the loss, the loss itself (`TOTAL`), and
-            the norm of its gradient before the clip (`NORM`).
+            the norm of its gradient before clipping (`NORM`).
 
         Raises:
-            RuntimeError: A gradient is not finite; module and optimiser are those before the update.
+            RuntimeError: A gradient is not finite; module and optimiser are unchanged.
         """
         count = len(next(iter(rows.values())))
         self._load_rows(rows)
@@ -133,7 +133,7 @@ class GpuSteps:
         return part.to(self._device)
 
     def _load_rows(self, rows: Mapping[str, Tensor]) -> None:
-        """Put the rows where recorded steps read them, which changes only if they have more room there."""
+        """Copy the rows to the memory of recorded steps; if it is too small, enlarge it and drop the step."""
         count = len(next(iter(rows.values())))
         if not self._rows or len(next(iter(self._rows.values()))) < count:
             room = -(-count // ROOM) * ROOM
@@ -150,7 +150,7 @@ class GpuSteps:
             own.copy_(given)
 
     def _load_moments(self, optimizer: torch.optim.Optimizer) -> None:
-        """Return Adam's state, zeros before its first step, and its step size of this moment."""
+        """Copy Adam's state (zeros before its first step) and its current step size to the device."""
         (group,) = optimizer.param_groups
         self._lr.fill_(float(group["lr"]))
         for own, given in zip(self._parameters, group["params"], strict=True):
@@ -166,7 +166,7 @@ class GpuSteps:
         return state
 
     def _give_back(self, module: nn.Module, optimizer: torch.optim.Optimizer) -> None:
-        """Copy weights and moments back to the processor."""
+        """Copy weights and moments back to the CPU."""
         for given, own in zip(_tensors(module), _tensors(self._module), strict=True):
             given.copy_(own)
         (group,) = optimizer.param_groups
@@ -176,9 +176,9 @@ class GpuSteps:
                 kept[name] = value.cpu().clone() if name not in kept else kept[name].copy_(value)
 
     def _record(self, part: Tensor, grad_clip: float, variant: Hashable) -> Recorded | None:
-        """Return a recorded step of as many rows; None without a GPU.
+        """Return a recorded step for this number of rows; None without a GPU.
 
-        Where it has to be recorded first, that moves weights and moments: they are to be loaded afterwards.
+        Recording changes weights and moments: load them afterwards.
         """
         key = (len(part), grad_clip, variant)
         if self._recorded is not None and self._recorded.key == key:
@@ -201,7 +201,7 @@ class GpuSteps:
         return self._recorded
 
     def _step(self, picked: Tensor, grad_clip: float) -> None:
-        """Take one gradient step on the picked rows, and add its figures to the sums."""
+        """Take one gradient step on the picked rows, and add its metrics to the sums."""
         total, figures = self._loss(self._module, {name: part[picked] for name, part in self._rows.items()})
         self._adam.zero_grad(set_to_none=True)
         total.backward()
@@ -215,7 +215,7 @@ class GpuSteps:
 
 
 def _tensors(module: nn.Module) -> list[Tensor]:
-    """Return all that a module learns or counts."""
+    """Return the parameters and buffers of a module."""
     return [value.detach() for value in (*module.parameters(), *module.buffers())]
 
 

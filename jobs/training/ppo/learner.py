@@ -3,11 +3,11 @@
 The value targets, the loss, its gradient and the optimiser are RLlib's (`test_ppo_learner.py`
 compares them, and the weights after an update). Around each minibatch of 32 steps RLlib slices,
 dispatches, times and logs, which takes longer than the gradient of two small networks; here that
-is done once per iteration, and no pipeline of connectors makes the batch. Policies of dense layers
+is done once per iteration, and no connector pipeline builds the batch. Policies of dense layers
 alone take their steps in `models.policy.dense_update`. RLlib appends a row to each episode to
-bootstrap its value: it masks that row in the loss, but counts it in minibatches and in the mean and
-deviation of the advantages. Here it is in neither. Recurrent networks learn from sequences of steps
-(Hausknecht and Stone 2015): each begins with the state in which the env runner acted.
+bootstrap its value. It masks this row in the loss, but counts it in minibatches and in the mean and
+deviation of the advantages; here the row counts in neither. Recurrent networks learn from sequences of
+steps (Hausknecht and Stone 2015): each starts with the state in which the env runner acted.
 """
 
 import math
@@ -48,36 +48,36 @@ READ = (
     Postprocessing.VALUE_TARGETS,
 )
 GRADIENT_NORM_KEY = "gradients_default_optimizer_global_norm"
-# Of a minibatch, in the order in which `update_dense` returns them.
+# Metrics of a minibatch, in the order in which `update_dense` returns them.
 FIGURES = (POLICY_LOSS_KEY, VF_LOSS_KEY, ENTROPY_KEY, PPOTorchLearner.TOTAL_LOSS_KEY, GRADIENT_NORM_KEY)
 MOST_THREADS = 8
-MIN_DEVIATION = 1e-4  # that advantages are divided by, as RLlib
-# Of the learner's own settings: it multiplies rewards; episodes keep the true ones.
-REWARD_SCALE = "reward_scale"
-SHAPING = "shaping"  # of these: rewards are shaped by the potential -SHAPING `log_costs`
-VALUE_WARMUP = "value_warmup"  # of these: environment steps in which only the value network learns
+MIN_DEVIATION = 1e-4  # smallest divisor of the advantages, as in RLlib
+# Keys of the learner's own settings.
+REWARD_SCALE = "reward_scale"  # factor of the rewards in the learner; episodes have unscaled rewards
+SHAPING = "shaping"  # rewards are shaped by the potential -shaping * `log_costs`
+VALUE_WARMUP = "value_warmup"  # environment steps in which only the value network learns
 
 
 def _minibatch(parts: dict[str, Tensor], picked: Tensor) -> dict[str, Any]:
-    """Return some sequences as the loss reads them."""
+    """Return the picked sequences in the form that the loss reads."""
     rows = {name: part[picked] for name, part in parts.items()}
     return {**rows, Columns.STATE_IN: {STATE: rows.pop(STATES)}}
 
 
 def shared_threads(config: Any) -> int:
-    """Return threads of a learner while the env runners wait: one for each of them, at most `MOST_THREADS`.
+    """Return the learner's number of threads: one per env runner, at most `MOST_THREADS`.
 
-    The number of cores does not count: sums are added in another order by other threads, and a training
-    that is resumed on another machine must give the same weights.
+    The env runners wait meanwhile. The number of cores does not matter: more threads would add sums in
+    another order, and a training that is resumed on another machine must give the same weights.
     """
     return max(1, min(config.num_env_runners, MOST_THREADS))
 
 
 class PlainPPOLearner(PPOTorchLearner):
-    """PPO for one module with discrete actions, without the divergence penalty, on one device."""
+    """PPO for one module with discrete actions, without the KL penalty, on one device."""
 
     def build(self) -> None:
-        """Build RLlib's learner, and its steps on a GPU if there is one."""
+        """Build RLlib's learner and, if there is a GPU, its `GpuSteps`."""
         super().build()
         require(self, LEARNER)
         self._warming_up = False
@@ -103,11 +103,11 @@ class PlainPPOLearner(PPOTorchLearner):
         minibatch_size: int | None = None,
         **kwargs: Any,
     ) -> Any:
-        """Take all epochs over the steps of one iteration, shuffled in each.
+        """Run all epochs over the steps of one iteration, in another random order in each epoch.
 
         Args:
-            training_data: Episodes, as RLlib hands them over; or else
-            episodes: the episodes themselves.
+            training_data: The episodes as RLlib passes them; None: `episodes` has them.
+            episodes: The episodes, if `training_data` is None.
             timesteps: Counters that schedules follow.
             num_epochs: Passes over the steps.
             minibatch_size: Steps per gradient; None: all.
@@ -117,7 +117,7 @@ class PlainPPOLearner(PPOTorchLearner):
             Metrics, as RLlib's learner returns them; losses are means over the last epoch.
 
         Raises:
-            RuntimeError: A gradient is not finite; the weights are those before it.
+            RuntimeError: A gradient is not finite; its step is not taken.
         """
         counters = dict(timesteps or {})
         self.before_gradient_based_update(timesteps=counters)
@@ -138,7 +138,7 @@ class PlainPPOLearner(PPOTorchLearner):
         return self.metrics.reduce()
 
     def _improve(self, rows: dict[str, Tensor], num_epochs: int, minibatch_size: int) -> dict[str, Any]:
-        """Take all epochs over the rows; return the figures of the last."""
+        """Run all epochs over the rows; return the metrics of the last epoch."""
         orders = torch.stack([torch.randperm(len(rows[Columns.ACTIONS])) for _ in range(num_epochs)])
         learn = self._epochs_compiled if self._compiled and not self._warming_up else self._epochs
         if self._gpu is not None:
@@ -147,18 +147,18 @@ class PlainPPOLearner(PPOTorchLearner):
             learn = self._epochs_of_sequences
         figures = learn(rows, orders, minibatch_size)
         if self._warming_up:
-            self.get_optimizer(DEFAULT_MODULE_ID).state.clear()  # Adam counts the steps of all weights alike
+            self.get_optimizer(DEFAULT_MODULE_ID).state.clear()  # Adam has one count of steps for all weights
         return figures | {LEARNER_RESULTS_VF_EXPLAINED_VAR_KEY: self._explained_variance(rows)}
 
     def own_state(self) -> dict[str, np.ndarray]:
-        """Return what the next updates depend on, besides RLlib's own state."""
+        """Return the state on which the next updates depend, besides RLlib's own: none here."""
         return {}
 
     def set_own_state(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Continue from the `own_state` of an earlier process, which is among these arrays."""
+        """Restore the `own_state` of an earlier process, which is among these arrays."""
 
     def _threads(self) -> int:
-        """Return one thread per env runner, which wait meanwhile; one for networks too small to share."""
+        """Return `shared_threads`, or 1 for networks whose compiled steps are too small to share."""
         return 1 if self._compiled else shared_threads(self.config)
 
     @property
@@ -190,7 +190,7 @@ class PlainPPOLearner(PPOTorchLearner):
         taken = np.ones(len(stacks), bool)
         taken[ends - 1] = False
         estimate = np.concatenate(estimates)
-        with np.errstate(invalid="ignore"):  # an infinite reward ends with the gradients that it makes NaN
+        with np.errstate(invalid="ignore"):  # an infinite reward makes gradients NaN, which are an error
             standard = (estimate - estimate.mean()) / max(MIN_DEVIATION, estimate.std())
         columns = {
             Columns.OBS: stacks[taken],
@@ -210,7 +210,7 @@ class PlainPPOLearner(PPOTorchLearner):
         return {name: torch.from_numpy(column) for name, column in columns.items()}
 
     def _rewards(self, episode: SingleAgentEpisode) -> np.ndarray:
-        """Return an episode's rewards as the learner reads them: shaped if asked for, and scaled."""
+        """Return an episode's rewards for learning: shaped if `SHAPING` is set, and scaled."""
         settings, rewards = self.config.learner_config_dict, episode.get_rewards()
         if settings.get(SHAPING, 0.0):
             potentials = -settings[SHAPING] * log_costs(episode)
@@ -243,7 +243,7 @@ class PlainPPOLearner(PPOTorchLearner):
         return dict(zip(FIGURES, means.tolist(), strict=True))
 
     def _on_gpu(self) -> GpuSteps | None:
-        """Return the steps on a GPU if the learner has one and the network wants it, else None."""
+        """Return `GpuSteps` if the learner has a GPU and the network takes its steps there, else None."""
         module, device = self._policy, learner_device()
         if device == "cpu" or module.network.gradients != "gpu":
             return None
@@ -290,13 +290,13 @@ class PlainPPOLearner(PPOTorchLearner):
     def _epochs_of_sequences(
         self, rows: dict[str, Tensor], orders: Tensor, minibatch_size: int
     ) -> dict[str, Any]:
-        """Pass over the rows in sequences of at most `SEQUENCE` successive steps, shuffled as wholes."""
+        """Run `_epochs` over sequences of at most `SEQUENCE` successive steps, each shuffled as a whole."""
         parts = sequences(rows, SEQUENCE)
-        # Short sequences make more than steps / SEQUENCE of them.
+        # If sequences are short, there are more than steps / SEQUENCE.
         everything = minibatch_size >= len(rows[Columns.ACTIONS])
         size = len(parts[FIRST_ROW]) if everything else max(1, minibatch_size // SEQUENCE)
         for order in orders:
-            # An order of sequences from one of rows: each comes where its first row does.
+            # Sort the sequences by the place of their first row in the order of rows.
             first = parts[FIRST_ROW]
             ranks = torch.empty_like(order)
             ranks[order] = torch.arange(len(order))
@@ -312,7 +312,7 @@ class PlainPPOLearner(PPOTorchLearner):
         return {name: torch.stack([one[name] for one in figures]).mean() for name in FIGURES}
 
     def _step(self, rows: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Take one gradient step; return its losses, entropy and the gradient's norm before the clip."""
+        """Take one gradient step; return its losses, entropy and the gradient's norm before clipping."""
         optimizer = self.get_optimizer(DEFAULT_MODULE_ID)
         parameters = optimizer.param_groups[0]["params"]
         total, figures = self._loss(self._policy, rows)
@@ -333,7 +333,7 @@ class PlainPPOLearner(PPOTorchLearner):
         return float(self.entropy_coeff_schedulers_per_module[DEFAULT_MODULE_ID].get_current_value())
 
     def _loss(self, module: Any, rows: dict[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the sum of clipped surrogate, squared error of the value and entropy, as RLlib's."""
+        """Return RLlib's PPO loss (clipped surrogate, squared value error and entropy) and its parts."""
         config = self.config
         out = module._forward_train(rows)
         logps = torch.log_softmax(out[Columns.ACTION_DIST_INPUTS], dim=-1)
@@ -354,7 +354,7 @@ class PlainPPOLearner(PPOTorchLearner):
 
     @torch.no_grad()
     def _explained_variance(self, rows: dict[str, Tensor]) -> Tensor:
-        """Return the fraction of the targets' variance that the values explain; at least -1, as RLlib's."""
+        """Return the fraction of the targets' variance that the values explain; at least -1, as in RLlib."""
         targets = rows[Postprocessing.VALUE_TARGETS]
         if self._policy.state_size:
             parts = sequences(rows, SEQUENCE)

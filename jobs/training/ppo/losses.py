@@ -5,8 +5,8 @@ import torch
 from torch import Tensor
 
 STARTS = "step_of_piece"  # column: number of a step in its piece of an episode, int64
-FIRST_ROW = "first_row"  # of sequences (C, L, ...): the row of the first step of each, int64 (C,)
-TAKEN = "taken"  # of sequences: which steps are real, bool (C, L); the others fill the last sequences
+FIRST_ROW = "first_row"  # of sequences (C, L, ...): row of each sequence's first step, int64 (C,)
+TAKEN = "taken"  # of sequences: True for real steps, False for padding, bool (C, L)
 
 
 def advantages(
@@ -15,9 +15,9 @@ def advantages(
     """Return generalised advantage estimates of a piece of an episode (Schulman et al. 2016), float64 (T,).
 
     Args:
-        values: Of its T + 1 observations, (T + 1,).
-        rewards: Of its T steps, (T,).
-        terminated: Whether it ended for good, so that its last observation has no value.
+        values: Values of the T + 1 observations, (T + 1,).
+        rewards: Rewards of the T steps, (T,).
+        terminated: Whether the episode terminated; its last observation then has the value 0.
         gamma: Discount per step.
         lambda_: Weight of longer estimates.
     """
@@ -32,11 +32,11 @@ def advantages(
 
 
 def shaping(potentials: np.ndarray, terminated: bool, gamma: float) -> np.ndarray:
-    """Return the shaping of a piece's rewards by a potential (Ng, Harada and Russell 1999), (T,).
+    """Return the potential-based shaping of a piece's rewards (Ng, Harada and Russell 1999), (T,).
 
     Args:
-        potentials: Of its T + 1 places, (T + 1,).
-        terminated: Whether it ended for good; its last place then has the potential 0.
+        potentials: Potentials of the T + 1 places, (T + 1,).
+        terminated: Whether the episode terminated; its last place then has the potential 0.
         gamma: Discount per step.
     """
     after = potentials[1:].copy()
@@ -49,11 +49,11 @@ def sequences(rows: dict[str, Tensor], most: int) -> dict[str, Tensor]:
 
     Args:
         rows: Columns (N, ...), among them `STARTS`.
-        most: Steps.
+        most: Most steps of a sequence.
 
     Returns:
-        Columns (C, most, ...), `FIRST_ROW` and `TAKEN`; the recurrent state, as every column named
-        "recurrent_state", is that of the first step alone, (C, S).
+        Columns (C, most, ...), `FIRST_ROW` and `TAKEN`; of "recurrent_state" only the state before each
+        sequence's first step, (C, S).
     """
     steps = rows[STARTS]
     first = torch.nonzero(steps % most == 0)[:, 0]
@@ -66,5 +66,5 @@ def sequences(rows: dict[str, Tensor], most: int) -> dict[str, Tensor]:
 
 
 def mean_over(taken: Tensor | None, values: Tensor) -> Tensor:
-    """Return the mean of values, of sequences that over the real steps."""
+    """Return the mean of values; for sequences, the mean over the real steps."""
     return values.mean() if taken is None else values[taken].mean()

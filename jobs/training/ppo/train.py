@@ -1,4 +1,4 @@
-"""PPO as appendix D.1.2 states it, in RLlib's words."""
+"""RLlib's configuration of PPO, as appendix D.1.2 states it."""
 
 import math
 from pathlib import Path
@@ -21,7 +21,7 @@ from jobs.training.sampling.teacher import SIGHT_M, PricedEnvRunner
 from models.kinds import PolicySpec
 from models.policy.rllib_module import module_spec
 
-WAITING_CPUS = 0.1  # of a core, for a process that waits most of the time; RLlib cannot do with none
+WAITING_CPUS = 0.1  # cores of a process that waits most of the time; RLlib does not accept 0
 LOSSES = {
     "train/policy_loss": "policy_loss",
     "train/value_loss": "vf_loss",
@@ -32,14 +32,14 @@ FIGURES = {"train/explained_variance": "vf_explained_var"}
 
 
 class Parts(NamedTuple):
-    """The parts in which an algorithm on PPO's env runners differs from PPO.
+    """The parts in which algorithms with PPO's sampling differ.
 
     Attributes:
-        env_runner: The class of its env runners.
-        learner: The class of its learner.
-        settings: The learner's settings beside RLlib's own.
+        env_runner: Class of the env runners.
+        learner: Class of the learner.
+        settings: The learner's settings in addition to RLlib's own.
         lr: Adam's step size: a number, or (environment step, value) pairs between which RLlib interpolates.
-        privileged: Numbers of each step that the value network alone reads.
+        privileged: How many numbers per step only the value network reads.
     """
 
     env_runner: type
@@ -50,15 +50,15 @@ class Parts(NamedTuple):
 
 
 def build(config: Config, encoder_path: str | Path | None = None, init: Path | None = None) -> PPOConfig:
-    """Return RLlib's configuration of PPO; every default of RLlib that differs from the paper's is set.
+    """Return RLlib's configuration of PPO; set every default of RLlib that differs from the paper's.
 
     Args:
         config: The experiment.
         encoder_path: The pretrained encoder's file, for a policy that has one.
-        init: The file of networks to begin from instead of random weights.
+        init: The file of networks to start from instead of random weights.
 
     Raises:
-        ConfigError: If the encoder was made for another sensor, or for another model than the
+        ConfigError: The encoder was trained for another sensor, or is another model than the
             one to fine-tune.
     """
     algo = cast(AlgoConfig, config.algo)
@@ -76,9 +76,9 @@ def build(config: Config, encoder_path: str | Path | None = None, init: Path | N
 def build_of(
     parts: Parts, config: Config, encoder_path: str | Path | None = None, init: Path | None = None
 ) -> PPOConfig:
-    """Return RLlib's configuration of an algorithm of these parts; other arguments as of `build`."""
+    """Return RLlib's configuration of an algorithm with these parts; other arguments as in `build`."""
     algo = cast(AlgoConfig, config.algo)
-    # The learner works while the env runners, if any, wait: together they need a core for each of these.
+    # The learner works while the env runners, if any, wait: one core per env runner is enough for all.
     runners = algo.num_env_runners
     own_cpus = WAITING_CPUS if runners else 1
     encoder = pretrained_encoder(config, encoder_path)
@@ -94,7 +94,7 @@ def build_of(
             sample_timeout_s=SAMPLE_TIMEOUT_S,
             gym_env_vectorize_mode="vector_entry_point",
             env_runner_cls=parts.env_runner,
-            merge_env_runner_states=False,  # of connectors, which these env runners have none of
+            merge_env_runner_states=False,  # states of connectors: these env runners have none
             broadcast_env_runner_states=False,
         )
         .resources(num_cpus_for_main_process=own_cpus)
@@ -133,13 +133,13 @@ def _optimiser(ppo: PPOConfig, algo: AlgoConfig, parts: Parts) -> PPOConfig:
 
 
 def shared_settings(algo: AlgoConfig) -> dict[str, object]:
-    """Return the settings of any learner on these env runners."""
+    """Return the settings that all learners on these env runners share."""
     settings: dict[str, object] = {REWARD_SCALE: algo.reward_scale}
     return settings if algo.teacher_sight_m is None else {**settings, SIGHT_M: algo.teacher_sight_m}
 
 
 def learner_settings(config: Config) -> dict[str, object]:
-    """Return the settings of PPO's learner beside RLlib's own."""
+    """Return the settings of PPO's learner in addition to RLlib's own."""
     algo = cast(AlgoConfig, config.algo)
     settings = shared_settings(algo)
     if algo.shaping:

@@ -1,1 +1,1 @@
-"""Any algorithm of RLlib's, configured by its user: RLlib's own networks, env runners and learner."""
+"""Any RLlib algorithm, configured by the user, with RLlib's own networks, env runners and learner."""

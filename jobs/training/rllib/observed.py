@@ -1,4 +1,4 @@
-"""A corridor whose observation is what a policy's networks read: one flat vector of features."""
+"""The corridor environment with the input of a policy's networks as its observation: one flat vector."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -17,17 +17,17 @@ from models.policy.memory import kept_shape, remember, windows_us
 
 
 class ObservedCorridor(gymnasium.Env):
-    """The environment of `CorridorEnv`, seen through the features and the memory of a policy.
+    """`CorridorEnv` whose observations pass through the features and the memory of a policy.
 
-    RLlib's default networks read float32 vectors, so a policy of dense layers is trained by any algorithm.
+    RLlib's default networks read float32 vectors, so any algorithm can train a policy of dense layers.
     """
 
     def __init__(self, context: Mapping[str, Any]) -> None:
-        """Make the environment.
+        """Create the environment.
 
         Args:
-            context: `config` and `conditions` as of `TrainingCorridors`, `spec` (the policy), and
-                `encoder_file` of a policy with a frozen encoder, else None; `reward_scale`.
+            context: `config` and `conditions` as for `TrainingCorridors`; `spec`, the policy; `encoder_file`,
+                None for a policy without a frozen encoder; `reward_scale`.
         """
         self._env = CorridorEnv(context["config"], draw=episode_draw(context.get("conditions", [{}])))
         self._spec: PolicySpec = context["spec"]
@@ -54,7 +54,7 @@ class ObservedCorridor(gymnasium.Env):
         self._env.close()
 
     def _seen(self, shown: np.ndarray, taken: Any) -> np.ndarray:
-        """Return what the networks read; `taken` is the action of the step, None at the start."""
+        """Return the networks' input as a flat vector; `taken` is this step's action, None at the start."""
         windows = shown[None]
         features = feature_of(self._spec).from_observations(windows, self._spec, self._encoder)
         began, last = np.array([taken is None]), np.array([taken or 0])

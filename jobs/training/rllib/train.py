@@ -1,4 +1,4 @@
-"""An algorithm of RLlib's with the networks that RLlib gives it; its policy is exported like any other."""
+"""Any RLlib algorithm with RLlib's default networks; its policy is exported like any other."""
 
 from pathlib import Path
 from typing import Any, cast
@@ -18,7 +18,7 @@ from jobs.training.trainable import guarded
 from models.kinds import PolicySpec
 from models.policy.networks import assemble
 
-# Where RLlib's modules of an algorithm with discrete actions have the networks that act: below, and the head.
+# Names of the acting networks (body, head) in RLlib's modules of algorithms with discrete actions.
 ACTING = (("pi_encoder", "pi"), ("encoder.actor_encoder", "pi"), ("encoder.encoder", "pi"), ("encoder", "af"))
 
 
@@ -26,8 +26,8 @@ def build(config: Config, encoder_path: str | Path | None = None, init: Path | N
     """Return RLlib's configuration of the algorithm that `algo.algorithm` names.
 
     Raises:
-        ConfigError: There is none of this name, it refuses a setting, the policy has other networks than
-            dense layers, or training is to begin from a policy.
+        ConfigError: RLlib has no algorithm of this name, the algorithm lacks a setting, the policy is not
+            made of dense layers, or `train.init` is set.
     """
     algo, spec = cast(RLlibConfig, config.algo), policy_spec(config)
     _check(config, spec)
@@ -62,7 +62,7 @@ def build(config: Config, encoder_path: str | Path | None = None, init: Path | N
 
 
 def _check(config: Config, spec: PolicySpec) -> None:
-    """Raise ConfigError for a policy that RLlib's default networks cannot be."""
+    """Raise ConfigError if RLlib's default networks cannot be the policy, or if `train.init` is set."""
     if config.train.init is not None:
         raise ConfigError(f"train.init: must be null for algo.name=rllib, got {config.train.init!r}")
     if spec.finetuned or "hidden" not in spec.manifest():
@@ -80,18 +80,18 @@ def _class(algo: RLlibConfig, default: bool = False) -> Any:
 
 
 def trainable(config: Config) -> type:
-    """Return RLlib's class of the algorithm, as Tune runs it here."""
+    """Return RLlib's class of the algorithm, `guarded` for Tune."""
     return guarded(_class(cast(RLlibConfig, config.algo)))
 
 
 def networks(module: Any, spec: PolicySpec) -> nn.ModuleDict:
-    """Return the networks of a policy that acts as a trained module of RLlib's: copies of its dense layers.
+    """Return the policy's networks with copies of the dense layers of a trained RLlib module.
 
-    A Q-network's logits are its Q-values, or the advantages of a dueling one: the likeliest action is the
-    greedy one. The value network is not exported, because only training reads it.
+    The logits of a Q-network are its Q-values, of a dueling Q-network its advantages, so the likeliest action
+    is the greedy one. The value network is set to zero, because only training reads it.
 
     Raises:
-        ValueError: The module has other layers than the policy.
+        ValueError: The layers of the module differ from the policy's.
     """
     own, names = assemble(spec), {name for name, _ in module.named_modules()}
     where: tuple[str, ...] = next((pair for pair in ACTING if names.issuperset(pair)), ())

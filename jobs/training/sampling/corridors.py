@@ -12,13 +12,13 @@ from models.kinds import KINDS
 
 
 class TrainingCorridors(CorridorVectorEnv):
-    """The environments of one env runner; each episode draws one of the conditions of the training.
+    """The environments of one env runner; each episode draws one of the training's conditions.
 
-    A class, and no registered name, so that `Algorithm.from_checkpoint` finds it in any process.
+    A class instead of a registered name, so that `Algorithm.from_checkpoint` finds it in any process.
     """
 
     def __init__(self, context: Mapping[str, Any]) -> None:
-        """Make the environments of RLlib's context: `corridor_settings`, and `num_envs`."""
+        """Create the environments from RLlib's context: `corridor_settings` and `num_envs`."""
         draw = episode_draw(context.get("conditions", [{}]))
         super().__init__(context["num_envs"], context["config"], draw=draw)
 
@@ -26,8 +26,8 @@ class TrainingCorridors(CorridorVectorEnv):
 def corridor_settings(config: Config) -> dict[str, object]:
     """Return the `env_config` of `TrainingCorridors`.
 
-    Tune resumes a training only under the keys and kinds of values that it began with, so a setting
-    of later versions appears only where it is used.
+    Tune resumes a training only with the keys and types of values with which it started, so a setting
+    of later versions is included only if it is used.
     """
     observation = KINDS[config.model.name].observation
     settings: dict[str, object] = {

@@ -1,14 +1,14 @@
 """RLlib's environment runner with all episodes of a process in one loop over arrays.
 
-RLlib appends each number of each step to the object of its episode and sends every step through
-two pipelines of connectors, which takes longer than simulating it. Here the steps of all
-corridors are kept as arrays, and the episodes are cut out of them at the end: the same episodes
-as from RLlib's own runner with connectors that stack features (`test_env_runner.py` compares the
+RLlib appends each number of each step to an episode object and sends every step through two
+connector pipelines, which takes longer than simulating the step. Here the steps of all corridors
+are stored as arrays, and the episodes are cut from them at the end. The episodes are the same as
+from RLlib's own env runner with connectors that stack features (`test_env_runner.py` compares the
 bytes).
 
 The features of a step (`models.policy.features`) are computed exactly once, and the stack of the
-last ones replaces the observation: PPO's epochs and its bootstrap values read stacks, and a raw
-window never leaves the env runner.
+newest ones replaces the observation. PPO's epochs and its bootstrap values read stacks, so raw
+windows never leave the env runner.
 """
 
 import uuid
@@ -28,22 +28,22 @@ from jobs.training.sampling.rllib_internals import ENV_RUNNER, require
 from jobs.training.sampling.snapshots import Snapshot, generators, set_generators
 from jobs.training.sampling.window_sample import WindowSample
 
-STATES = "recurrent_state"  # column of a step: the state of a recurrent network before it, float32 (S,)
+STATES = "recurrent_state"  # column of a step: a recurrent network's state before the step, float32 (S,)
 MAX_SAMPLE_S = 900.0  # an env runner compiles kernels for a minute first, on a busy machine for several
 
 
 class Step(NamedTuple):
-    """One step of all N episodes, each an array (N, ...).
+    """One step of all N episodes, each field an array (N, ...).
 
     Attributes:
-        stacks: What the policy saw before it.
-        actions: What was done, int64.
-        outputs: What is kept of the policy's decision, by RLlib's name.
-        rewards: True ones, float64.
+        stacks: Input of the policy before the step.
+        actions: Actions taken, int64.
+        outputs: Stored outputs of the policy, by RLlib's name.
+        rewards: Unscaled rewards, float64.
         terminated: Whether the episode ended by contact or goal.
         truncated: Whether the episode ended by its time limit.
-        infos: The environments', each value an array.
-        over: Where the environment was reset instead of stepped.
+        infos: Infos of the environments, each value an array.
+        over: Whether the environment was reset instead of stepped.
     """
 
     stacks: np.ndarray
@@ -57,14 +57,14 @@ class Step(NamedTuple):
 
 
 class Part(NamedTuple):
-    """What one env runner contributes to a round of sampling.
+    """The contribution of one env runner to a round of sampling.
 
     Attributes:
-        runner: Which one, RLlib's `worker_index`.
-        began: Its rounds before this one, and the number of the weights that it sampled with.
-        episodes: As `PlainEnvRunner.sample` returns them.
-        metrics: As RLlib's `get_metrics` returns them.
-        after: Where it stands now.
+        runner: RLlib's `worker_index` of the env runner.
+        began: Number of its rounds before this one, and sequence number of the weights used.
+        episodes: Episodes as returned by `PlainEnvRunner.sample`.
+        metrics: Metrics as returned by RLlib's `get_metrics`.
+        after: State of the env runner after the round.
     """
 
     runner: int
@@ -79,14 +79,14 @@ class RolloutError(RuntimeError):
 
 
 class Raised:
-    """Stands for the samples of an env runner that failed; re-raises its error in the learner process."""
+    """Replaces the samples of a failed env runner; re-raises its error in the learner process."""
 
     def __init__(self, reason: str) -> None:
-        """Remember why."""
+        """Store the error's text."""
         self.reason = reason
 
     def __getitem__(self, index: int) -> Any:
-        """Raise it."""
+        """Raise RolloutError."""
         raise RolloutError(self.reason)
 
 
@@ -94,7 +94,8 @@ class PlainEnvRunner(SingleAgentEnvRunner):
     """Rolls out the episodes of one process, without connectors; its module computes the features.
 
     RLlib restarts an env runner that died or hangs, which is right. It would also restart one whose
-    code raised, hide the reason in a log, and fail the same way again: such an error is passed on.
+    code raised an error, hide the reason in a log, and fail the same way again. Here such an error is
+    passed on to the learner.
     """
 
     _callbacks: list[Any]
@@ -103,8 +104,8 @@ class PlainEnvRunner(SingleAgentEnvRunner):
     def __init__(self, **settings: Any) -> None:
         """Build the environments and the policy.
 
-        In a process of its own an error is kept and raised by the next call: RLlib would otherwise go
-        on without the env runner, and fail for lack of it.
+        In a separate process, an error is stored and raised by the next call. RLlib would otherwise
+        continue without the env runner, and fail for lack of it.
         """
         self._refused, self.shown = "", WindowSample()
         try:
@@ -116,7 +117,7 @@ class PlainEnvRunner(SingleAgentEnvRunner):
             self._refused = one_line(error)
 
     def assert_healthy(self) -> None:
-        """Check RLlib's parts; a process that could not be built answers too."""
+        """Run RLlib's check, but not after a failed construction: that process must answer too."""
         if not self._refused:
             super().assert_healthy()
 
@@ -126,19 +127,19 @@ class PlainEnvRunner(SingleAgentEnvRunner):
             raise RolloutError(self._refused)
 
     def get_spaces(self) -> Any:
-        """Return RLlib's spaces; RLlib asks for these first.
+        """Return RLlib's spaces, for which RLlib asks first.
 
         Raises:
-            RolloutError: The process could not be built.
+            RolloutError: The construction failed.
         """
         self._check_built()
         return super().get_spaces()
 
     def sample(self, **asked: Any) -> list[SingleAgentEpisode]:
-        """Roll out as asked, in less than `MAX_SAMPLE_S`.
+        """Roll out the requested steps; end the process if that takes longer than `MAX_SAMPLE_S`.
 
         Raises:
-            RolloutError: With the type and text of whatever was raised.
+            RolloutError: An error was raised; the message has its type and text.
         """
         self._check_built()
         try:
@@ -151,17 +152,17 @@ class PlainEnvRunner(SingleAgentEnvRunner):
         """Sample one round; return it with the state before and after.
 
         Raises:
-            RolloutError: With the type and text of whatever was raised.
+            RolloutError: An error was raised; the message has its type and text.
         """
         self._check_built()
         began = self._callbacks[0].rounds, self._weights_seq_no
         return Part(self.worker_index, began, self.sample(), self.get_metrics(), self.snapshot())
 
     def snapshot(self) -> Snapshot:
-        """Return all that the next rounds depend on except the weights; episodes are their actions so far.
+        """Return the state on which the next rounds depend, without weights; episodes are stored as actions.
 
         Raises:
-            RolloutError: The process could not be built.
+            RolloutError: The construction failed.
         """
         self._check_built()
         values = {"metrics": self._callbacks[0].state(), "steps": self.shown.steps}
@@ -180,13 +181,13 @@ class PlainEnvRunner(SingleAgentEnvRunner):
         return Snapshot(values, arrays)
 
     def resume(self, snapshot: Snapshot) -> str:
-        """Continue from the snapshot of another process; the weights come by `set_state`.
+        """Continue from the snapshot of another process; `set_state` sets the weights.
 
         Returns:
-            Why the episodes start again instead, in a few words; empty if they go on.
+            Why the episodes are restarted instead, in a few words; empty if they continue.
 
         Raises:
-            RolloutError: The process could not be built.
+            RolloutError: The construction failed.
         """
         self._check_built()
         arrays = snapshot.arrays
@@ -200,7 +201,7 @@ class PlainEnvRunner(SingleAgentEnvRunner):
         return problem
 
     def _replay(self, snapshot: Snapshot) -> str:
-        """Simulate the episodes under way up to where they were; return what differs, empty if nothing."""
+        """Simulate the running episodes up to the snapshot; return what differs, empty if nothing does."""
         arrays = snapshot.arrays
         actions = np.split(arrays["actions"], np.cumsum(arrays["actions_taken"])[:-1])
         series = arrays["episode_seed"].tolist(), arrays["episode_number"].tolist()
@@ -212,13 +213,14 @@ class PlainEnvRunner(SingleAgentEnvRunner):
         self._stacks, none = arrays["stacks"], np.zeros((len(self._over), 0), np.float32)
         self._state = arrays.get(STATES, none)
         shown = self.module.features(observations)
-        if not np.array_equal(shown, self._stacks[:, -1, ..., : shown.shape[-1]]):  # without the own action
+        # Without the own action and velocity that `remember` appends.
+        if not np.array_equal(shown, self._stacks[:, -1, ..., : shown.shape[-1]]):
             return "the simulation shows something else than before"
         self._episodes = list(zip(snapshot.values["names"], actions, strict=True))
         return ""
 
     def apply(self, func: Callable[..., Any], *values: Any, **named: Any) -> Any:
-        """Call a function as RLlib does, but pass a rollout's error on instead of ending the process."""
+        """Call a function as RLlib does, but return a RolloutError as `Raised` instead of raising it."""
 
         def handed_on(runner: Any, *values: Any, **named: Any) -> Any:
             try:
@@ -240,11 +242,11 @@ class PlainEnvRunner(SingleAgentEnvRunner):
         """Roll out at least `num_timesteps` steps, all episodes in lock-step.
 
         Returns:
-            The episodes that ended, in the order in which they did, then the pieces of those
-            that go on; observations are stacks of features, `get_infos()` is a dict of arrays (T + 1,).
+            The ended episodes in the order of their end, then the pieces of the running ones;
+            observations are stacks of features, `get_infos()` is a dict of arrays (T + 1,).
 
         Raises:
-            ValueError: Something else was asked than steps of the policy's drawn actions.
+            ValueError: The request is not for a number of steps with actions drawn from the policy.
         """
         if num_timesteps is None or random_actions or not explore:
             raise ValueError("PlainEnvRunner rolls out num_timesteps of drawn actions and nothing else")
@@ -262,7 +264,7 @@ class PlainEnvRunner(SingleAgentEnvRunner):
         return done + going_on
 
     def _reset_all(self) -> None:
-        """Start every episode again; unfinished ones are dropped."""
+        """Start a new episode in every environment; drop unfinished ones."""
         seed = self._seed if self._needs_initial_reset else None
         observations, infos = self.env.unwrapped.reset(seed=seed)
         first, space = np.ones(self.env.num_envs, bool), self.module.observation_space
@@ -274,7 +276,7 @@ class PlainEnvRunner(SingleAgentEnvRunner):
         self._needs_initial_reset = False
 
     def _step(self) -> Step:
-        """Step every episode; finished ones start again instead."""
+        """Step every environment, or reset it if its episode has ended."""
         stacks, over = self._stacks, self._over
         actions, outputs = self._decide(stacks)
         observations, rewards, terminated, truncated, infos = self.env.unwrapped.step(actions)
@@ -284,17 +286,17 @@ class PlainEnvRunner(SingleAgentEnvRunner):
         return Step(stacks, actions, outputs, rewards, terminated, truncated, infos, over)
 
     def velocities_mps(self) -> np.ndarray | None:
-        """Return what each vehicle measures now, (N, 2) [m/s]; None for a policy that does not ask."""
+        """Return each vehicle's measured velocity (N, 2) [m/s]; None for a policy that does not read it."""
         if not self.module.spec.own_velocity:
             return None
         return np.array([env.measured_velocity_mps for env in self.env.unwrapped.envs])
 
     def _remember(self, observations: Any, first: np.ndarray, taken: np.ndarray) -> None:
-        """Add what each environment shows to what the policy keeps.
+        """Add the newest observation of each environment to the policy's memory.
 
         Args:
-            observations: One for each environment.
-            first: bool (N,), True where an episode begins.
+            observations: One observation per environment.
+            first: bool (N,), True where an episode starts.
             taken: int (N,), the actions of the step that ended with these observations.
         """
         if self.module.encoder is not None:
@@ -303,7 +305,7 @@ class PlainEnvRunner(SingleAgentEnvRunner):
 
     @torch.no_grad()
     def _decide(self, stacks: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """Return drawn actions (N,), and by name the logits (N, actions) and a recurrent network's states."""
+        """Draw actions (N,); return them, and by name the logits (N, actions) and any recurrent states."""
         before = {STATES: self._state} if self.module.state_size else {}
         decided, self._state = self._run(stacks, self._state)
         logits = torch.from_numpy(decided)
@@ -325,7 +327,7 @@ class PlainEnvRunner(SingleAgentEnvRunner):
         for row in range(over.shape[1]):
             first = 0
             for last in [*np.flatnonzero(ended[:, row]), len(steps)]:
-                if over[first : first + 1, row].any():  # reset here: the episode begins after it
+                if over[first : first + 1, row].any():  # a reset: the episode starts after it
                     self._episodes[row] = _begun()
                     first += 1
                 end = min(last + 1, len(steps))
@@ -367,16 +369,16 @@ class PlainEnvRunner(SingleAgentEnvRunner):
 
 
 def _begun() -> tuple[str, np.ndarray]:
-    """Return an episode that begins: its name, and the actions so far."""
+    """Return a new episode: its name, and its actions so far, none."""
     return uuid.uuid4().hex, np.empty(0, np.int16)
 
 
 def _logps(logits: np.ndarray, actions: np.ndarray) -> np.ndarray:
-    """Log-probabilities float32 (...) of actions (...) by logits (..., actions)."""
+    """Return the log-probabilities float32 (...) of actions (...) given logits (..., actions)."""
     logps = torch.log_softmax(torch.from_numpy(logits), dim=-1)
     return logps.gather(-1, torch.from_numpy(actions)[..., None])[..., 0].numpy()
 
 
 def _by_name(infos: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Return infos of T steps as arrays (T, N); names with an underscore are Gymnasium's masks."""
+    """Return infos of T steps as arrays (T, N), without Gymnasium's masks, which start with an underscore."""
     return {name: np.stack([info[name] for info in infos]) for name in infos[0] if name[0] != "_"}

@@ -13,26 +13,26 @@ from jobs.training.sampling.env_runner import PlainEnvRunner
 from models.encoder.evae import EventVAE
 from models.encoder.weights import EncoderFileError, EncoderManifest, load_encoder
 
-EPISODES = 100  # that a rate is averaged over
-REWARD_SCALE = "reward_scale"  # in an `env_config`: environments have multiplied rewards by it
+EPISODES = 100  # newest ones, over which metrics are averaged
+REWARD_SCALE = "reward_scale"  # in an `env_config`: the factor by which environments multiply rewards
 DRIFT_EVERY = 10  # rounds of sampling: a measurement takes a tenth of a second
 
 
 class EpisodeMetrics(RLlibCallback):
-    """Metrics of episodes, from the environments' infos; rewards are not scaled.
+    """Metrics of episodes, from the environments' infos; returns are of unscaled rewards.
 
-    An iteration ends two or three episodes, so metrics are means over the last `EPISODES`. Episodes
-    count in the order in which they began, those of one round of sampling together: of those begun
-    at once the short ones end first, and these are crashes.
+    Only two or three episodes end per iteration, so metrics are means over the last `EPISODES`. Episodes
+    count in the order of their start, and all that start in one round of sampling count together. In the
+    order of their end, short episodes, which are crashes, would count first.
 
     Attributes:
-        rounds: Of sampling, so far.
+        rounds: Number of rounds of sampling so far.
     """
 
     def __init__(self) -> None:
-        """Begin without episodes."""
+        """Start without episodes."""
         self._episodes: deque[dict[str, float]] = deque(maxlen=EPISODES)
-        self._begun: deque[dict[str, dict[str, float] | None]] = deque()  # of each round; None: in the air
+        self._begun: deque[dict[str, dict[str, float] | None]] = deque()  # per round; None: running
         self._unfinished: dict[str, float] = {}
         self.rounds, self._reward_scale = 0, 1.0
         self._encoder: tuple[EventVAE, EncoderManifest] | None = None
@@ -40,7 +40,7 @@ class EpisodeMetrics(RLlibCallback):
     def on_sample_end(
         self, *, metrics_logger: Any, samples: Any, env_runner: Any = None, **kwargs: Any
     ) -> None:
-        """Count events and the outcome of each episode that ended; measure drift at times."""
+        """Log events, means over ended episodes and, every `DRIFT_EVERY` rounds, the encoder's drift."""
         if isinstance(env_runner, PlainEnvRunner) and self.rounds % DRIFT_EVERY == 0:
             for name, value in self._drift(env_runner).items():
                 metrics_logger.log_value(name, value, window=1)
@@ -59,7 +59,7 @@ class EpisodeMetrics(RLlibCallback):
             metrics_logger.log_value(name, mean, window=1)
 
     def _count(self, samples: Any) -> None:
-        """Add the episodes that ended to those of the metrics, as soon as it is their turn."""
+        """Store ended episodes; add a round's to the averaged ones once they and all earlier ones ended."""
         self._begun.append({chunk.id_: None for chunk in samples if chunk.id_ not in self._unfinished})
         for chunk in samples:
             earned = float(chunk.get_return()) / self._reward_scale
@@ -74,7 +74,7 @@ class EpisodeMetrics(RLlibCallback):
             self._episodes.extend(ended for ended in self._begun.popleft().values() if ended)
 
     def state(self) -> dict[str, Any]:
-        """Return what the next metrics depend on, for JSON."""
+        """Return the state on which the next metrics depend, as values for JSON."""
         return {
             "rounds": self.rounds,
             "episodes": list(self._episodes),
@@ -83,24 +83,24 @@ class EpisodeMetrics(RLlibCallback):
         }
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Continue from a `state`."""
+        """Restore a `state`."""
         self.rounds = state["rounds"]
         self._episodes = deque(state["episodes"], maxlen=EPISODES)
         self._begun = deque(dict(begun) for begun in state["begun"])
         self._unfinished = dict(state["unfinished"])
 
     def _drift(self, runner: PlainEnvRunner) -> dict[str, float]:
-        """Return the `jobs.rollout.diagnostics.drift_metrics` of the windows that the encoder was shown.
+        """Return the `jobs.rollout.diagnostics.drift_metrics` of the windows that the encoder has read.
 
-        They are empty without an encoder, and if its file is gone or lean: the frozen part that acts has
-        no decoder.
+        They are empty without an encoder, or if its file is missing, changed or has no decoder: the frozen
+        part that acts has no decoder either.
         """
         file, windows = runner.module.model_config["encoder_file"], runner.shown.windows
         if file is None or not windows:
             return {}
         if self._encoder is None:
             try:
-                with torch.random.fork_rng(devices=[]):  # a model is made with random weights first
+                with torch.random.fork_rng(devices=[]):  # a new model draws random weights
                     self._encoder = load_encoder(file.path)
             except EncoderFileError:
                 return {}
@@ -121,6 +121,6 @@ def outcome(info: Mapping[str, float], episode_return: float) -> dict[str, float
 
 
 def _column(chunk: Any, key: str) -> np.ndarray:
-    """Return one number of the infos after each step of a piece of an episode, (T,)."""
+    """Return the value `key` of the infos after each step of an episode's piece, (T,)."""
     infos = chunk.get_infos()
     return infos[key][1:] if isinstance(infos, Mapping) else np.array([info[key] for info in infos[1:]])

@@ -1,4 +1,4 @@
-"""The private names of RLlib that this package relies on; another version may lack any of them.
+"""The private names of RLlib on which this package relies; other versions may lack some of them.
 
 `sampling.env_runner` and `ppo.learner` replace RLlib's loops over single steps and minibatches, and
 `sampling.rounds` its loop over env runners. RLlib has no public interface for them. A test compares these
@@ -30,10 +30,10 @@ MODULE = ("_forward", "_forward_train")
 
 
 def require(part: object, names: Sequence[str]) -> None:
-    """Check that a part of RLlib has the names that are relied on.
+    """Check that a part of RLlib has the required names.
 
     Raises:
-        RuntimeError: One is missing; the message says which version of Ray was tested.
+        RuntimeError: A name is missing; the message states which version of Ray was tested.
     """
     missing = [name for name in names if not hasattr(part, name)]
     if missing:

@@ -1,8 +1,8 @@
-"""Rounds of sampling in which every env runner takes part exactly once, whatever becomes of its process.
+"""Rounds of sampling in which every env runner takes part exactly once, even if its process is lost.
 
-RLlib goes on without an env runner that was lost, and its replacement begins new episodes. Here the
-replacement is led to where the lost one began the round, and samples what that would have sampled: a training
-has the same bytes as one in which nothing was lost.
+RLlib continues without a lost env runner, and the replacement starts new episodes. Here the replacement is
+restored to the lost env runner's state at the start of the round and samples what the lost one would have
+sampled. The training then has the same bytes as one without losses.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,23 +20,23 @@ from jobs.training.sampling.snapshots import Snapshot
 
 MAX_RESTARTS = 3  # of a failing env runner; RLlib's 1000 would hide a broken environment for hours
 MAX_PAUSE_S = 600.0  # until an env runner has started again: a busy machine takes minutes
-SAMPLE_TIMEOUT_S = MAX_SAMPLE_S + 60.0  # a process that hangs ends itself before
+SAMPLE_TIMEOUT_S = MAX_SAMPLE_S + 60.0  # a process that hangs ends itself earlier
 LOCAL = 0  # index of the env runner in this process
 
 
 class Rounds:
-    """Takes rounds with the env runners of a training; without processes of their own, with the local one.
+    """Samples rounds with the env runners of a training, or with the local one if there are no others.
 
     Attributes:
-        snapshots: Where each env runner stood after the last round, or stands before the first.
-        problems: Why episodes had to start again, in a few words each.
+        snapshots: State of each env runner after the last round, or before the first round.
+        problems: Reasons why episodes had to be restarted, in a few words each.
     """
 
     def __init__(self, group: EnvRunnerGroup) -> None:
-        """Remember where the env runners begin.
+        """Store the initial state of the env runners.
 
         Raises:
-            RolloutError: One has died for good, or does not answer.
+            RolloutError: An env runner has died for good, or does not answer.
         """
         require(group, GROUP)
         self.problems: list[str] = []
@@ -52,7 +52,7 @@ class Rounds:
         """Sample one round with every env runner; return their parts by index.
 
         Raises:
-            RolloutError: What an env runner raised; or one has died for good, or does not come back.
+            RolloutError: An env runner raised an error, has died for good, or does not come back.
         """
         parts: dict[int, Part] = {}
         while due := [index for index in self.snapshots if index not in parts]:
@@ -62,10 +62,10 @@ class Rounds:
         return [parts[index] for index in self.snapshots]
 
     def resume(self, indices: Sequence[int]) -> None:
-        """Lead env runners to where they stood after the last round, with the newest weights.
+        """Restore the state of env runners after the last round, with the newest weights.
 
         Raises:
-            RolloutError: One has died for good, or does not come back.
+            RolloutError: An env runner has died for good, or does not come back.
         """
         if not indices:
             return
@@ -84,7 +84,7 @@ class Rounds:
         self.problems += filter(None, said)
 
     def _sampled(self, due: list[int]) -> list[Part]:
-        """Return what the env runners sampled that are alive."""
+        """Return the parts of the env runners that answered."""
         if not self._indices:
             return [self._group.local_env_runner.take_part()]
         results = self._manager.foreach_actor(
@@ -94,10 +94,10 @@ class Rounds:
         return [Part(*result.get()) for result in results if result.ok]
 
     def _fits(self, part: Part) -> bool:
-        """Whether an env runner sampled from where it stood, with the newest weights; else it has to again.
+        """Whether an env runner sampled from its snapshot with the newest weights; if not, it must repeat.
 
-        Ray may have started its process again before anyone asked, and RLlib leaves a message with
-        weights out if the one before it is still on its way.
+        Ray may have restarted its process unnoticed, and RLlib omits a message with weights while the
+        previous one is on its way.
         """
         rounds, weights = part.began
         same = rounds == self.snapshots[part.runner].values["metrics"]["rounds"]
@@ -108,7 +108,7 @@ class Rounds:
     def _until_answered(
         self, ask: Callable[[Any], tuple[Any, ...]], indices: Sequence[int]
     ) -> dict[int, Any]:
-        """Return what env runners return, by index; those that are being started again are waited for."""
+        """Return the answers of env runners by index; wait for env runners that are being restarted."""
         answers: dict[int, Any] = {}
         while missing := [index for index in indices if index not in answers]:
             results = self._manager.foreach_actor(
@@ -128,7 +128,7 @@ class Rounds:
 
     @staticmethod
     def _check_alive(results: Any) -> None:
-        """Raise an error if an env runner will not be started again."""
+        """Raise RolloutError if an env runner will not be restarted."""
         for result in results:
             if not result.ok and isinstance(result.get(), ActorDiedError):
                 ended = low_memory(str(result.get()))

@@ -1,7 +1,7 @@
-"""What the future of a training depends on beside its weights and its optimiser, as plain values and arrays.
+"""The state of a training besides its weights and its optimiser, as plain values and arrays.
 
-The random generators of each of its processes; and of each env runner the episodes under way, the metrics of
-those that ended, and the windows that its module met. A checkpoint holds them as JSON and as arrays.
+It consists of each process's random generators and, for each env runner, the running episodes, the metrics
+of ended ones, and the newest windows that its encoder has read. A checkpoint has it as JSON and as arrays.
 """
 
 import json
@@ -15,17 +15,17 @@ import torch
 from jobs.run.files import RunError, read_json, write_json
 
 FOLDER = "snapshots"  # in a checkpoint
-LAYOUT = 1  # of a snapshot; another number is refused
+LAYOUT = 1  # version of a snapshot's layout; other versions are rejected
 ABOUT = "layout.json"
 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """Where a process stands.
+    """The state of a process.
 
     Attributes:
-        values: What JSON can hold.
-        arrays: The rest; its bytes are kept.
+        values: Values that JSON can represent.
+        arrays: The rest, restored byte for byte.
     """
 
     values: dict[str, Any]
@@ -38,12 +38,12 @@ def generators() -> dict[str, np.ndarray]:
     return {
         "torch_generator": torch.get_rng_state().numpy(),
         "numpy_generator": words,
-        "numpy_position": np.array(rest, np.float64),  # and the normal number that is kept for the next call
+        "numpy_position": np.array(rest, np.float64),  # and the cached normal number
     }
 
 
 def set_generators(arrays: dict[str, np.ndarray]) -> None:
-    """Continue the random numbers of `generators`."""
+    """Restore the states of `generators`."""
     torch.set_rng_state(torch.from_numpy(arrays["torch_generator"]))
     position, kept, normal = arrays["numpy_position"].tolist()
     np.random.set_state(("MT19937", arrays["numpy_generator"], int(position), int(kept), normal))  # noqa: NPY002
@@ -54,18 +54,18 @@ def write_snapshots(checkpoint: Path, snapshots: dict[str, Snapshot]) -> None:
     folder = checkpoint / FOLDER
     folder.mkdir()
     for name, snapshot in snapshots.items():
-        # NaN is no JSON, but Python reads and writes it.
+        # NaN is not valid JSON, but Python reads and writes it.
         (folder / f"{name}.json").write_text(json.dumps(snapshot.values))
-        # Not compressed: it takes a second for 20 MB, saves 8 %, and all processes wait.
+        # Compression would take a second for 20 MB and save 8 %, and all processes would wait.
         np.savez(folder / f"{name}.npz", **snapshot.arrays)  # type: ignore[arg-type]
     write_json(folder / ABOUT, {"layout": LAYOUT, "processes": list(snapshots)})
 
 
 def read_snapshots(checkpoint: Path) -> dict[str, Snapshot] | None:
-    """Return the snapshots of a checkpoint; None if it has none, as those of earlier versions.
+    """Return the snapshots of a checkpoint; None if it has none, because it is of an earlier version.
 
     Raises:
-        RunError: They have another layout.
+        RunError: The snapshots have another layout.
     """
     folder = checkpoint / FOLDER
     if not folder.is_dir():
@@ -78,6 +78,6 @@ def read_snapshots(checkpoint: Path) -> dict[str, Snapshot] | None:
 
 
 def _read(path: Path) -> Snapshot:
-    """Return one snapshot, of the files that `path` names without their ending."""
+    """Return one snapshot; `path` is the path of its two files without suffix."""
     with np.load(path.with_suffix(".npz"), allow_pickle=False) as arrays:
         return Snapshot(json.loads(path.with_suffix(".json").read_text()), dict(arrays))

@@ -1,4 +1,4 @@
-"""Env runners beside which a planner stands that knows the geometry, and says what each place costs."""
+"""Env runners with a teacher: a planner that knows the geometry and returns the cost of each action."""
 
 import math
 from collections import defaultdict
@@ -11,18 +11,17 @@ from envs.vehicles.planning import Planner
 from jobs.training.sampling.env_runner import PlainEnvRunner, Step
 from jobs.training.sampling.snapshots import Snapshot
 
-# In an info: of the cheapest way (`envs.scene.planning`) to the goal line from where the next action acts.
+# Key of an info: cost of the cheapest way (`envs.scene.planning`) to the goal line, from where the next
+# action takes effect.
 COST_TO_GO = "cost_to_go"
-SIGHT_M = (
-    "teacher_sight_m"  # of the learner's own settings: how far the plans look, without it to the goal line
-)
+SIGHT_M = "teacher_sight_m"  # the learner's own setting: length of the plans [m]; missing: to the goal line
 
 
 class TeacherEnvRunner(PlainEnvRunner):
-    """As `PlainEnvRunner`, with a plan of each environment's scene."""
+    """A `PlainEnvRunner` with a planner for each environment."""
 
     def __init__(self, **settings: Any) -> None:
-        self._planners: dict[int, Planner] = defaultdict(Planner)  # of each environment
+        self._planners: dict[int, Planner] = defaultdict(Planner)  # row of the environment -> its planner
         super().__init__(**settings)
 
     def costs(self) -> np.ndarray:
@@ -33,7 +32,7 @@ class TeacherEnvRunner(PlainEnvRunner):
 
 
 class PricedEnvRunner(TeacherEnvRunner):
-    """As `PlainEnvRunner`; each info has `COST_TO_GO`. The policy never sees an info."""
+    """A `PlainEnvRunner` whose infos have `COST_TO_GO`; policies never see infos."""
 
     def _reset_all(self) -> None:
         super()._reset_all()
@@ -56,6 +55,6 @@ class PricedEnvRunner(TeacherEnvRunner):
 def log_costs(episode: SingleAgentEpisode) -> np.ndarray:
     """Return log(1 + `COST_TO_GO`) of the steps of an episode, float64 (T + 1,).
 
-    Costs are about 1 where a way is free, and 1000 where none is left; logarithms are 0.7 and 7.
+    Costs are about 1 where the way is free and 1000 where there is none; the results are 0.7 and 7.
     """
     return np.log1p(episode.get_infos()[COST_TO_GO])

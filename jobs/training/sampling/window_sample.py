@@ -1,4 +1,4 @@
-"""A sample of the event windows that a frozen encoder was shown, to measure its drift on."""
+"""A sample of the event windows that a frozen encoder has read, for measuring its drift."""
 
 from collections import deque
 from typing import Any
@@ -11,20 +11,20 @@ MOST = 128  # windows
 
 
 class WindowSample:
-    """The newest windows: one of each vector step, of each episode in turn.
+    """The newest windows: one per vector step, from each environment in turn.
 
     Attributes:
-        windows: As `models.encoder.event_batch.cut_packed` cuts them.
-        steps: Vector steps so far, which say whose turn it is.
+        windows: Windows as returned by `models.encoder.event_batch.cut_packed`.
+        steps: Number of vector steps so far, which determines whose turn it is.
     """
 
     def __init__(self) -> None:
-        """Begin without windows."""
+        """Start without windows."""
         self.windows: deque[np.ndarray] = deque(maxlen=MOST)
         self.steps = 0
 
     def add(self, observations: Any) -> None:
-        """Copy the window of the episode whose turn it is, out of packed windows of all episodes."""
+        """Copy the window of the environment whose turn it is from all environments' packed windows."""
         self.windows.append(cut_packed(observations[self.steps % len(observations)]))
         self.steps += 1
 
@@ -37,7 +37,7 @@ class WindowSample:
         }
 
     def load(self, arrays: dict[str, np.ndarray], steps: int) -> None:
-        """Continue from the windows of `arrays`, after so many steps."""
+        """Restore the windows of `arrays`, after `steps` vector steps."""
         ends = np.cumsum(arrays["met_rows"])[:-1]
         windows = np.split(arrays["met"], ends) if len(arrays["met_rows"]) else []
         self.windows, self.steps = deque(windows, maxlen=MOST), steps
