@@ -48,13 +48,10 @@ def test_what_no_measurement_could_test_is_drawn_apart():
         assert (min(beyond.get_xdata()), max(beyond.get_xdata())) == (2, max(CORES))
         assert beyond.get_linestyle() == "--"
         points = [line for label, line in lines.items() if label.startswith("measured")]
-        shared = {
-            count for line in points if line.get_markerfacecolor() == "none" for count in line.get_xdata()
+        marked = {
+            (count, line.get_markerfacecolor() == "none") for line in points for count in line.get_xdata()
         }
-        alone = {
-            count for line in points if line.get_markerfacecolor() != "none" for count in line.get_xdata()
-        }
-        assert (alone, shared) == ({1, 2}, {4})
+        assert marked == {(1, False), (2, False), (4, True)}  # hollow: shared cores
 
 
 def test_the_page_tells_what_the_model_and_the_points_are():

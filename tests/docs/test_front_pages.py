@@ -160,10 +160,8 @@ def test_the_robust_policy_does_as_the_pages_say():
     expected = [min(means.values()), max(means.values()), len(means)]
     assert said(r"reaches (\d+) to (\d+) % under (\d+) conditions", "docs/index.md") == expected
     assert said(r"each: (\d+) to (\d+) % under (\d+) conditions", "docs/train.md") == expected
-    assert said(r"(\d+) % in `poles_dense` and (\d+) % there at 25 Hz", "docs/train.md") == [
-        dense["200"],
-        dense["25"],
-    ]
+    told = said(r"(\d+) % in `poles_dense` and (\d+) % there at 25 Hz", "docs/train.md")
+    assert told == [dense["200"], dense["25"]]
     late = mean(success("robustness")["action_delay", "100", "bytestream_hold"].values())
     assert said(r"With actions 100 ms late it reaches (\d+) %", "docs/index.md") == [round(late)]
 
@@ -179,8 +177,7 @@ def test_the_readme_counts_the_formats_that_can_be_written(tmp_path):
 def test_the_page_of_claims_tells_what_is_certain_from_what_an_interval_excludes():
     rows = family_rows("ppo_claims", "claims")
     excluded = [row for row in rows if "no gain" in row["verdict"] or row["verdict"] == "reversed"]
-    certain = [
-        row for row in excluded if row["certain_in_family"] in ("reversed", "no gain", "no gain, no loss")
-    ]
+    verdicts = ("reversed", "no gain", "no gain, no loss")
+    certain = [row for row in excluded if row["certain_in_family"] in verdicts]
     pattern = r"Of these (\d+) tests, (\d+) exclude a gain by their own interval, (\d+) of them for certain"
     assert said(pattern, "docs/claims.md") == [len(rows), len(excluded), len(certain)]

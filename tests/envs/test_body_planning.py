@@ -65,14 +65,14 @@ def test_where_nothing_stands_straight_on_is_cheapest_and_sides_are_equal():
     assert np.allclose(costs, costs[::-1], atol=1e-3)
 
 
-@pytest.mark.parametrize("speed_mps", [10.0, 20.0])
-def test_the_planner_comes_through(speed_mps):
-    assert all(flown(seed, speed_mps=speed_mps)["success"] for seed in range(8))
+DISTURBED = {"drag_per_s": 0.3, "wind_x_mps": 3.0, "mass_ratio": 1.15}
 
 
-def test_it_comes_through_with_delay_wind_and_mass():
-    body = {"primitives": 15, "drag_per_s": 0.3, "wind_x_mps": 3.0, "mass_ratio": 1.15}
-    assert all(flown(seed, action_delay_ms=100.0, body=body)["success"] for seed in range(6))
+@pytest.mark.parametrize(
+    "settings", [{}, {"action_delay_ms": 100.0, "body": {"primitives": 15, **DISTURBED}}]
+)
+def test_the_planner_comes_through(settings):
+    assert all(flown(seed, **settings)["success"] for seed in range(4))
 
 
 def test_it_finds_back_from_random_actions():
@@ -81,7 +81,7 @@ def test_it_finds_back_from_random_actions():
     def sometimes(costs):
         return int(rng.integers(15)) if rng.random() < 0.3 else int(costs.argmin())
 
-    assert sum(flown(seed, sometimes)["success"] for seed in range(8)) >= 7
+    assert sum(flown(seed, sometimes)["success"] for seed in range(4)) >= 3
 
 
 def test_a_vehicle_that_cannot_be_planned_for_is_refused():

@@ -1,7 +1,6 @@
 import dataclasses
 import math
 
-import gymnasium
 import numpy as np
 import pytest
 from gymnasium.error import ResetNeeded
@@ -9,9 +8,9 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 from envs.config import CameraConfig, EnvConfig, FaultsConfig, FidelityConfig, seen_settings
-from envs.corridor import CorridorEnv, CorridorVectorEnv
+from envs.corridor import CorridorEnv
 from envs.events import unpack_window
-from envs.kinematics import Lane, advance, clock_us, planned_position
+from envs.kinematics import Lane, advance, clock_us
 from envs.scene import OBSTACLE, POLE, Scene
 
 SMALL = CameraConfig(width=16, height=16)
@@ -19,20 +18,16 @@ EMPTY = {"layout": {"num_obstacles": 0}, "camera": SMALL}
 FAULTY = FaultsConfig(sparsity=0.3, background_activity=0.2, background_activity_hz=50.0)
 
 
-def corridor(poles=(), width_m=30.0):
+def move(poles, start, planned, radius_m):
+    """One control step of a vehicle at a height of 2 m among poles (x, y, radius)."""
     obstacles = np.array([(POLE, x, y, 3.0, r, r, 3.0, 0.5) for x, y, r in poles], OBSTACLE)
-    return Scene("test", obstacles, width_m=width_m, spawn_range_m=(0.0, 0.0))
+    scene = Scene("test", obstacles)
+    return advance(Lane(radius_m, 15.0, scene.length_m), scene.sections(2.0), start, planned)
 
 
-def move(scene, start, planned, radius_m):
-    """One control step of a vehicle at a height of 2 m."""
-    lane = Lane(radius_m, 0.5 * scene.width_m, scene.length_m)
-    return advance(lane, scene.sections(2.0), start, planned)
-
-
-def straight(env, seed=0, **options):
+def straight(env, seed=0):
     """Fly forward to the end; all results of step."""
-    env.reset(seed=seed, **options)
+    env.reset(seed=seed)
     results = [env.step(0)]
     while not (results[-1][2] or results[-1][3]):
         results.append(env.step(0))
@@ -40,14 +35,12 @@ def straight(env, seed=0, **options):
 
 
 def flight_bytes(env, seed, actions):
-    """All that a vehicle gives, as bytes; it starts again when it is over."""
+    """All that a vehicle gives, as bytes."""
     observation, info = env.reset(seed=seed)
     seen = [observation.tobytes(), repr(info)]
     for action in actions:
         observation, reward, terminated, truncated, info = env.step(action)
         seen += [observation.tobytes(), repr((reward, terminated, truncated, info)), env.events.tobytes()]
-        if terminated or truncated:
-            env.reset()
     return seen
 
 
@@ -59,17 +52,7 @@ def test_the_environment_passes_the_checkers(observation):
     check_env_sb3(env)
 
 
-def test_it_can_be_made_by_name_single_and_vectorised():
-    env = gymnasium.make("envs.corridor:evade/Corridor-v0", camera=SMALL)
-    assert isinstance(env.unwrapped, CorridorEnv)
-    many = gymnasium.make_vec(
-        "envs.corridor:evade/Corridor-v0", 2, vectorization_mode="vector_entry_point", camera=SMALL
-    )
-    assert isinstance(many, CorridorVectorEnv)
-    assert many.metadata["autoreset_mode"] == gymnasium.vector.AutoresetMode.NEXT_STEP
-
-
-@pytest.mark.parametrize("control_hz", [45.0, 100.0, 200.0, 400.0, 37.3])
+@pytest.mark.parametrize("control_hz", [37.3, 200.0, 400.0])
 def test_a_straight_success_returns_200_at_any_rate(control_hz):
     results = straight(CorridorEnv(**EMPTY, control_hz=control_hz, fidelity=FidelityConfig(max_step_m=10.0)))
     assert abs(sum(r[1] for r in results) - 200.0) < 1e-9
@@ -79,13 +62,6 @@ def test_a_straight_success_returns_200_at_any_rate(control_hz):
     assert not info["collision"]
     assert info["distance_m"] == info["y_m"] == 100.0
     assert len(results) == math.ceil(5.0 * control_hz)
-
-
-def test_a_thousand_steps_of_a_tenth_of_a_metre_are_a_hundred_metres():
-    assert planned_position(0.0, (1000, 0, 0), (20.0, 200.0)) == (0.0, 100.0)
-    assert planned_position(3.0, (0, 500, 500), (20.0, 200.0))[0] == 3.0
-    x, y = planned_position(0.0, (0, 1, 0), (20.0, 200.0))
-    assert x == -y == pytest.approx(-0.1 / math.sqrt(2), abs=1e-15)
 
 
 def test_a_collision_returns_the_metres_to_the_contact_less_100():
@@ -126,39 +102,13 @@ def test_a_flight_to_the_side_ends_at_the_wall(action):
     ],
 )
 def test_what_comes_first_along_a_step_ends_it(pole_y, success, reward, end_y):
-    outcome = move(corridor([(0.0, pole_y, 1.5)]), (0.0, 0.0), (0.0, 5000.0), 0.5)
+    outcome = move([(0.0, pole_y, 1.5)], (0.0, 0.0), (0.0, 5000.0), 0.5)
     assert (outcome.success, outcome.collision) == (success, not success)
     assert outcome.reward == pytest.approx(reward, abs=1e-9)
     assert outcome.end == (0.0, pytest.approx(end_y, abs=1e-9))
 
 
-def test_a_success_ends_exactly_on_the_goal_line():
-    for start_y, end_y in np.random.default_rng(0).uniform((0.0, 100.0), (100.0, 1e5), (200, 2)):
-        outcome = move(corridor(), (0.0, start_y), (0.3, end_y), 0.3)
-        assert outcome.success
-        assert outcome.end[1] == 100.0
-        assert outcome.reward == 100.0 - start_y + 100.0
-
-
-def test_a_start_in_contact_is_a_collision_without_progress():
-    outcome = move(corridor([(0.0, 0.0, 1.0)]), (0.0, 0.0), (0.0, 0.1), 0.3)
-    assert outcome == ((0.0, 0.0), 0.0, -100.0, False, True)
-
-
-@pytest.mark.parametrize("speed_mps", [20.0, 1e3, 1e6])
-def test_no_speed_jumps_over_a_pole(monkeypatch, speed_mps):
-    monkeypatch.setattr("envs.corridor.make_scene", lambda *_, **__: corridor([(0.0, 40.0, 1.0)]))
-    config = EnvConfig(speed_mps=speed_mps, layout={"num_obstacles": 0}, camera=SMALL)
-    env = CorridorEnv(config, fidelity=FidelityConfig(max_step_m=1.0))
-    env.reset(seed=0)
-    info: dict = {"collision": False}
-    while not info["collision"]:
-        _, _, terminated, _, info = env.step(0)
-    assert terminated
-    assert info["y_m"] == pytest.approx(38.7, abs=1e-9)
-
-
-@pytest.mark.parametrize("hz", [45.0, 200.0, 999_999.5, 1e6, 0.1])
+@pytest.mark.parametrize("hz", [0.1, 45.0, 999_999.5])
 def test_the_clock_counts_steps_and_never_stands(hz):
     times = [clock_us(k, hz) for k in range(2000)]
     assert all(abs(t - k * 1e6 / hz) <= 0.5 for k, t in enumerate(times))
@@ -170,6 +120,7 @@ def test_past_the_time_limit_the_flight_is_truncated_and_not_terminated():
     assert len(results) == 20
     assert [r[2:4] for r in results[-2:]] == [(False, False), (False, True)]
     assert not results[-1][4]["success"]
+    assert results[-1][4]["y_m"] == 2.0  # exactly: no error adds up
     at_the_goal = straight(CorridorEnv(**EMPTY, time_limit_s=5.0, fidelity=FidelityConfig(max_step_m=9.0)))
     assert at_the_goal[-1][2:4] == (True, False)
 
@@ -177,7 +128,7 @@ def test_past_the_time_limit_the_flight_is_truncated_and_not_terminated():
 def test_the_window_holds_the_events_of_its_step():
     env = CorridorEnv()
     env.reset(seed=1)
-    for k in range(30):
+    for k in range(6):
         window, _, _, _, info = env.step(k % 3)
         events, window_us = unpack_window(window)
         assert window_us == 5000
@@ -187,46 +138,13 @@ def test_the_window_holds_the_events_of_its_step():
         assert np.array_equal(events, env.events)
 
 
-def test_events_that_a_window_cannot_hold_are_counted():
-    env = CorridorEnv(window_capacity=5)
-    env.reset(seed=1)
-    for _ in range(10):
-        window, _, _, _, info = env.step(0)
-    assert info["dropped_events"] == info["num_events"] - 5 > 0
-    assert np.array_equal(window[1:, 1], env.events["x"][-5:])
-
-
-def test_what_the_neighbour_filter_removes_is_not_counted_as_lost():
-    faults = FaultsConfig(background_activity=0.5)
-    env = CorridorEnv(faults=faults, filter_support=1, window_capacity=60)
-    many = CorridorVectorEnv(2, faults=faults, filter_support=1, window_capacity=60)
-    env.reset(seed=1)
-    many.reset(seed=[1, 2])
-    lost = 0
-    for _ in range(20):
-        window, *_, info = env.step(0)
-        _, *_, infos = many.step(np.array([0, 0]))
-        assert info["dropped_events"] == window[0, 1] == infos["dropped_events"][0]
-        assert info["num_events"] > len(env.seen_events)
-        lost += info["dropped_events"]
-    assert lost > 0
-
-
-@pytest.mark.parametrize("faults", [FaultsConfig(), FAULTY])
-def test_the_same_seed_gives_the_same_bytes(faults):
-    actions = np.random.default_rng(0).integers(0, 3, 60)
-    first = flight_bytes(CorridorEnv(camera=SMALL, faults=faults, time_limit_s=0.1), 7, actions)
-    assert first == flight_bytes(CorridorEnv(camera=SMALL, faults=faults, time_limit_s=0.1), 7, actions)
-    assert first != flight_bytes(CorridorEnv(camera=SMALL, faults=faults, time_limit_s=0.1), 8, actions)
-
-
 def test_splits_never_share_a_corridor_and_options_pick_an_episode():
     def poles(split, seed, episode):
         env = CorridorEnv(camera=SMALL, split=split)
         env.reset(seed=seed, options={"episode_number": episode})
         return env.scene.obstacles.tobytes(), env.camera_pose()
 
-    cases = [(s, seed, e) for s in ("train", "validation", "eval") for seed in (0, 1, 2) for e in (0, 1, 2)]
+    cases = [(s, seed, e) for s in ("train", "validation", "eval") for seed in (0, 1) for e in (0, 1)]
     assert len({poles(*case) for case in cases}) == len(cases)
     env = CorridorEnv(camera=SMALL)
     env.reset(seed=1)
@@ -234,40 +152,17 @@ def test_splits_never_share_a_corridor_and_options_pick_an_episode():
     assert (env.scene.obstacles.tobytes(), env.camera_pose()) == poles("train", 1, 1)
 
 
-@pytest.mark.parametrize("count", [1, 2])
-def test_the_info_of_an_episode_says_how_to_start_it_again(count):
-    many = CorridorVectorEnv(count, camera=SMALL, faults=FAULTY, time_limit_s=0.01)
-    infos = many.reset(seed=3)[1]
-    for _ in range(7):  # two steps and a reset each
-        observations, *_, infos = many.step(np.zeros(count, int))
-    again = CorridorEnv(camera=SMALL, faults=FAULTY)
-    for row in range(count):
-        number = infos["episode_number"][row]
-        again.reset(seed=int(infos["episode_seed"][row]), options={"episode_number": number})
-        assert number == 2
-        assert again.step(0)[0].tobytes() == observations[row].tobytes()
-
-
 def test_faults_leave_the_corridor_and_the_spawn_alone():
-    camera = CameraConfig(width=16, height=16, contrast_threshold=0.01)
-    clean, faulty = CorridorEnv(camera=camera), CorridorEnv(camera=camera, faults=FAULTY)
-    clean.reset(seed=4)
-    faulty.reset(seed=4)
+    clean, faulty = CorridorEnv(camera=SMALL), CorridorEnv(camera=SMALL, faults=FAULTY)
+    for env in (clean, faulty):
+        env.reset(seed=4)
+        env.step(0)
     assert clean.camera_pose() == faulty.camera_pose()
     assert clean.scene.obstacles.tobytes() == faulty.scene.obstacles.tobytes()
-    dead = faulty._sensor._real._pixels.dead
-    assert dead.sum() == round(0.3 * 256)
-    silenced = 0
-    for _ in range(20):
-        clean.step(0)
-        faulty.step(0)
-        silenced += dead[clean.events["y"], clean.events["x"]].sum()
-        assert not dead[faulty.events["y"], faulty.events["x"]].any()
-        assert (np.diff(faulty.events["t"]) >= 0).all()
-    assert silenced > 20
+    assert clean.events.tobytes() == faulty.true_events.tobytes() != faulty.events.tobytes()
 
 
-@pytest.mark.parametrize("action", [3, -1, 0.0, np.nan, None, "0", [0]])
+@pytest.mark.parametrize("action", [3, -1, 0.0, None, [0]])
 def test_an_action_outside_the_space_is_refused_and_the_flight_goes_on(action):
     env = CorridorEnv(**EMPTY)
     env.reset(seed=0)
@@ -284,36 +179,6 @@ def test_a_step_before_reset_or_after_the_end_is_refused():
     assert env.step(0)[3]
     with pytest.raises(ResetNeeded):
         env.step(0)
-
-
-def test_a_bad_number_stops_the_flight_naming_episode_step_and_seed():
-    env = CorridorEnv(**EMPTY)
-    env.reset(seed=11)
-    env.step(0)
-    env._sensor._renderer.frame["sky"] = np.nan
-    with pytest.raises(ValueError, match=r"episode 0, step 2, seed 11: .*pixel x=0, y=0 is nan"):
-        env.step(0)
-    with pytest.raises(ResetNeeded):
-        env.step(0)
-
-
-def test_a_reward_that_is_not_finite_is_refused():
-    env = CorridorEnv(camera=SMALL)
-    env.reset(seed=3)
-    env._vehicles.rows["y_m"] = math.nan
-    with pytest.raises(ValueError, match=r"episode 0, step 1, seed 3: the reward must be finite; got nan"):
-        env.step(0)
-    with pytest.raises(ResetNeeded):
-        env.step(0)
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [("control_hz", 0.0), ("control_hz", math.nan), ("scene", "moon"), ("render_mode", "human")],
-)
-def test_settings_that_make_no_sense_are_refused(name, value):
-    with pytest.raises(ValueError, match=f"{name}|{value}"):
-        CorridorEnv(**{name: value}).reset(seed=0)
 
 
 @pytest.mark.parametrize("options", [{"episode_number": -1}, {"episode_number": 1.5}, {"seed": 1}])
@@ -337,37 +202,34 @@ def test_the_picture_shows_luminance_beside_events():
 
 
 @pytest.mark.parametrize("scene", ["poles_dense", "dynamic"])
-@pytest.mark.parametrize("seed", range(3))
-def test_a_picture_is_that_of_the_event_camera_without_simulating_one(scene, seed):
+def test_a_picture_is_that_of_the_event_camera_without_simulating_one(scene):
     usual, alone = (CorridorEnv(scene=scene, camera=SMALL, observation=o) for o in ("window", "luminance"))
-    (_, before), (picture, info) = usual.reset(seed=seed), alone.reset(seed=seed)
+    (_, before), (picture, info) = usual.reset(seed=1), alone.reset(seed=1)
     assert (picture[..., 0] == usual.luminance).all()
-    actions, ended = np.random.default_rng(seed), False
-    for _ in range(200):
-        if ended:
-            break
-        action = int(actions.integers(3))
+    for action in np.random.default_rng(1).integers(0, 3, 40):
         _, *outcome, before = usual.step(action)
         picture, *others, info = alone.step(action)
         assert outcome == others
         assert (picture[..., 0] == usual.luminance).all()
         assert alone.events.size == info["num_events"] == 0
-        ended = outcome[1] or outcome[2]
     assert {**before, "num_events": 0} == info
 
 
-@pytest.mark.parametrize("observation", ["luminance", "window"])
-def test_a_picture_that_is_no_luminance_is_refused(monkeypatch, observation):
-    env = CorridorEnv(**EMPTY, observation=observation, fidelity=FidelityConfig(max_step_m=10.0))
-    env.reset(seed=0)
-    monkeypatch.setattr(
-        env._sensor._renderer, "render_way", lambda poses: np.full((1, 16, 16), np.nan, np.float32)
-    )
-    env._sensor._renderer.frame["sky"] = np.nan  # of columns that are looked at alone
-    with pytest.raises(ValueError, match=r"step 1.*luminance must be finite"):
+@pytest.mark.parametrize(
+    ("observation", "camera"),
+    [("window", SMALL), ("window", CameraConfig(16, 16, refractory_us=1)), ("luminance", SMALL)],
+)
+def test_a_bad_number_stops_the_flight_naming_its_step_and_the_next_one_flies(observation, camera):
+    env = CorridorEnv(**EMPTY | {"camera": camera, "observation": observation})
+    env.reset(seed=11)
+    env.step(0)
+    env._sensor._renderer.frame["sky"] = np.nan
+    with pytest.raises(ValueError, match=r"episode 0, step 2, seed 11: luminance must be finite"):
         env.step(0)
-    with pytest.raises(ValueError, match="luminance must be finite"):
-        env.reset()
+    with pytest.raises(ResetNeeded):
+        env.step(0)
+    env.reset()
+    assert env.step(0)[4]["t_us"] == 5000
 
 
 @pytest.mark.parametrize(
@@ -383,9 +245,9 @@ def test_a_picture_that_is_no_luminance_is_refused(monkeypatch, observation):
     ],
 )
 def test_flights_with_equal_seen_settings_are_equal(observation, same, other):
-    plain = EnvConfig(camera=SMALL, scene="shape_change", observation=observation, time_limit_s=0.5)
+    plain = EnvConfig(camera=SMALL, scene="shape_change", observation=observation)
     like, unlike = dataclasses.replace(plain, **same), dataclasses.replace(plain, **other)
     seen = [seen_settings(config, observation) for config in (plain, like, unlike)]
     assert seen[0] == seen[1] != seen[2]
-    episodes = [flight_bytes(CorridorEnv(config), 1, [0, 1, 2] * 30) for config in (plain, like, unlike)]
+    episodes = [flight_bytes(CorridorEnv(config), 1, [0, 1, 2] * 10) for config in (plain, like, unlike)]
     assert episodes[0] == episodes[1] != episodes[2]

@@ -1,8 +1,9 @@
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.optimize import linear_sum_assignment
@@ -15,34 +16,16 @@ from envs.fidelity import plan_renders
 from envs.scene import make_scene
 from jobs.rollout import diagnostics
 
-TIMES = st.integers(0, 30)
-
 
 def events(rows):
     return np.array([(t, x, y, p) for t, x, y, p in rows], EVENT)
 
 
 STREAMS = st.lists(
-    st.tuples(TIMES, st.integers(0, 1), st.integers(0, 1), st.sampled_from([-1, 1])), max_size=12
+    st.tuples(st.integers(0, 30), st.integers(0, 1), st.integers(0, 1), st.sampled_from([-1, 1])), max_size=12
 ).map(events)
 
 
-@settings(deadline=None)  # the first example compiles
-@given(STREAMS)
-def test_a_stream_differs_from_itself_by_nothing_in_any_order(stream):
-    assert event_error(stream, stream, 0.0) == 0.0
-    assert event_error(stream[::-1], stream, 0.0) == 0.0
-
-
-@settings(deadline=None)  # the first example compiles
-@given(STREAMS, STREAMS, st.integers(0, 10))
-def test_the_error_is_symmetric_and_a_share(one, other, tolerance_us):
-    error = event_error(one, other, tolerance_us)
-    assert error == event_error(other, one, tolerance_us)
-    assert 0.0 <= error <= 1.0
-
-
-@settings(deadline=None)  # the first example compiles
 @given(STREAMS, STREAMS, st.integers(0, 10))
 def test_as_many_events_pair_up_as_can(one, other, tolerance_us):
     fits = np.zeros((len(one), len(other)))
@@ -55,21 +38,12 @@ def test_as_many_events_pair_up_as_can(one, other, tolerance_us):
     assert event_error(one, other, tolerance_us) == pytest.approx(1 - 2 * pairs / total if total else 0.0)
 
 
-def test_pixel_polarity_and_time_must_all_agree():
-    one = events([(100, 3, 4, 1)])
-    assert event_error(one, events([(105, 3, 4, 1)]), 5.0) == 0.0
-    for other in [(106, 3, 4, 1), (100, 4, 4, 1), (100, 3, 3, 1), (100, 3, 4, -1)]:
-        assert event_error(one, events([other]), 5.0) == 1.0
-    assert event_error(one, one[:0], 5.0) == 1.0
-
-
-@pytest.mark.parametrize("tolerance_us", [-1.0, np.nan, np.inf])
+@pytest.mark.parametrize("tolerance_us", [-1.0, np.nan])
 def test_a_tolerance_that_cannot_be_is_refused(tolerance_us):
     with pytest.raises(ValueError, match="tolerance_us"):
         event_error(np.empty(0, EVENT), np.empty(0, EVENT), tolerance_us)
 
 
-@settings(deadline=None)  # the first example compiles
 @given(arrays(np.int64, 20, elements=st.integers(0, 2**50)))
 def test_far_times_are_compared_exactly(times):
     stream = np.zeros(20, EVENT)
@@ -81,17 +55,16 @@ def test_far_times_are_compared_exactly(times):
 
 def test_the_converged_simulation_has_no_error_and_more_renders_never_hurt_much():
     errors = []
-    for share in (1, 2, 4, 8):
+    for share in (1, 2, 8):
         asked = FidelityConfig(max_step_m=0.1 / share, samples=8)
         errors.append(measure_event_error(EnvConfig(fidelity=asked), flights=3, steps=8).error)
     assert (np.diff(errors) < 2e-3).all()  # a few events of thousands come and go once it has converged
-    assert errors[0] > 4 * errors[3]
-    assert errors[3] < 0.003
+    assert errors[0] > 4 * errors[2]
+    assert errors[2] < 0.003
 
 
-@pytest.mark.parametrize("scene_name", ["poles", "texture_change"])
-def test_the_converged_simulation_looks_more_often_and_no_setting_spoils_it(scene_name):
-    scene = make_scene(scene_name, np.random.default_rng(0))
+def test_the_converged_simulation_looks_more_often_and_no_setting_spoils_it():
+    scene = make_scene("texture_change", np.random.default_rng(0))
     usual = plan_renders(EnvConfig(), scene)
     camera = CameraConfig(memory="legacy", encoding="gamma8", contrast_threshold=0.2)
     spoilt = EnvConfig(camera=camera, fidelity=FidelityConfig(0.5), renderer="pyrender")
@@ -128,9 +101,10 @@ def test_a_camera_that_forgets_is_told_from_one_that_remembers():
     assert frame.events[0] < 0.8 * frame.events[1]
 
 
-@pytest.mark.parametrize(("scene", "flights", "steps"), [("poles", 4, 8), ("texture_change", 2, 3)])
-@pytest.mark.parametrize("hz", [45.0, 400.0])
-def test_the_error_achieved_is_within_the_tolerance_asked(scene, flights, steps, hz):
+@pytest.mark.parametrize(
+    ("scene", "hz", "flights", "steps"), [("poles", 45.0, 4, 8), ("texture_change", 400.0, 2, 3)]
+)
+def test_the_error_achieved_is_within_the_tolerance_asked(scene, hz, flights, steps):
     accuracy = measure_event_error(EnvConfig(scene=scene, control_hz=hz), flights, steps)
     assert accuracy.events[1] > 10
     assert accuracy.error <= EnvConfig().fidelity.tolerance
@@ -139,10 +113,7 @@ def test_the_error_achieved_is_within_the_tolerance_asked(scene, flights, steps,
 def test_culling_by_tolerance_adds_little_to_the_error_in_a_long_lane():
     lane = EnvConfig(layout={"last_y_m": 300.0, "num_obstacles": 120}, fidelity=FidelityConfig(0.2))
     whole = dataclasses.replace(lane, fidelity=FidelityConfig(0.2, cull_m=1e5))
-    culled, exact = (
-        measure_event_error(lane, flights=4, steps=8),
-        measure_event_error(whole, flights=4, steps=8),
-    )
+    culled, exact = (measure_event_error(config, flights=4, steps=8) for config in (lane, whole))
     assert exact.error < culled.error <= exact.error + 0.1 * 0.2
 
 
@@ -153,16 +124,13 @@ SCENES = ["poles", "cones", "gates", "poles_dense", "poles_eval", "shape_change"
 @pytest.mark.parametrize("scene", SCENES)
 def test_the_error_achieved_is_within_the_tolerance_asked_everywhere(scene):
     short = []
-    for hz in (45.0, 100.0, 200.0, 400.0):
-        for threshold in (0.05, 0.2, 0.5):
-            for tolerance in (0.02, 0.05, 0.2):
-                config = EnvConfig(scene=scene, control_hz=hz, fidelity=FidelityConfig(tolerance))
-                camera = dataclasses.replace(config.camera, contrast_threshold=threshold)
-                accuracy = measure_event_error(
-                    dataclasses.replace(config, camera=camera), flights=6, steps=12
-                )
-                if accuracy.error > tolerance:
-                    short.append((hz, threshold, tolerance, round(accuracy.error, 4)))
+    rates, thresholds, tolerances = (45.0, 100.0, 200.0, 400.0), (0.05, 0.2, 0.5), (0.02, 0.05, 0.2)
+    for hz, threshold, tolerance in itertools.product(rates, thresholds, tolerances):
+        camera = CameraConfig(contrast_threshold=threshold)
+        config = EnvConfig(scene=scene, control_hz=hz, camera=camera, fidelity=FidelityConfig(tolerance))
+        error = measure_event_error(config, flights=6, steps=12).error
+        if error > tolerance:
+            short.append((hz, threshold, tolerance, round(error, 4)))
     assert short == []
 
 
@@ -178,7 +146,6 @@ def test_a_job_says_what_it_achieves_and_whether_that_is_less_than_asked(monkeyp
     assert ("more than asked" in text) == says
 
 
-@pytest.mark.parametrize("observation", ["luminance", "none"])
-def test_a_simulation_without_a_camera_is_not_said_to_be_exact(observation):
-    with pytest.raises(ValueError, match=f"observation must be one that has a camera.*got '{observation}'"):
-        measure_event_error(EnvConfig(observation=observation))
+def test_a_simulation_without_a_camera_is_not_said_to_be_exact():
+    with pytest.raises(ValueError, match=r"observation must be one that has a camera.*got 'none'"):
+        measure_event_error(EnvConfig(observation="none"))

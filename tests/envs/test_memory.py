@@ -13,7 +13,6 @@ from envs.scene import make_scene
 
 STATM = Path("/proc/self/statm")
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(not STATM.exists(), reason="reads /proc, so Linux alone")]
-SMALL = CameraConfig(width=32, height=32)
 
 
 def resident_mb():
@@ -22,34 +21,41 @@ def resident_mb():
     return pages * resource.getpagesize() / 2**20
 
 
-def fly(env, steps, rng):
-    for _ in range(steps):
-        if any(env.step(int(rng.integers(3)))[2:4]):
-            env.reset()
+def grown_mb(work, warm_up, count):
+    """By how much memory has grown after `count` more of some work than it took to warm up."""
+    work(warm_up)
+    before = resident_mb()
+    work(count)
+    return resident_mb() - before
 
 
 @pytest.mark.parametrize("observation", ["window", "events", "event_image", "luminance", "none"])
 def test_twenty_thousand_steps_leave_it_as_it_was(observation):
     env, rng = CorridorEnv(observation=observation), np.random.default_rng(0)
     env.reset(seed=0)
-    fly(env, 4000, rng)
-    before = resident_mb()
-    fly(env, 20_000, rng)
-    assert resident_mb() - before < 3.0
+
+    def fly(steps):
+        for _ in range(steps):
+            if any(env.step(int(rng.integers(3)))[2:4]):
+                env.reset()
+
+    assert grown_mb(fly, 4000, 20_000) < 3.0
 
 
-def test_two_hundred_environments_that_are_closed_leave_it_as_it_was():
-    def make_and_close(count):
-        for seed in range(count):
-            env = CorridorEnv(camera=SMALL)
+@pytest.mark.parametrize(
+    ("renderer", "warm_up", "count", "most_mb"), [("auto", 50, 200, 3.0), ("pyrender", 6, 12, 12.0)]
+)
+def test_environments_and_opengl_contexts_that_are_closed_leave_it_as_it_was(
+    renderer, warm_up, count, most_mb
+):
+    def make_and_close(number):
+        for seed in range(number):
+            env = CorridorEnv(renderer=renderer, camera=CameraConfig(width=32, height=32))
             env.reset(seed=seed)
             env.step(0)
             env.close()
 
-    make_and_close(50)
-    before = resident_mb()
-    make_and_close(200)
-    assert resident_mb() - before < 3.0
+    assert grown_mb(make_and_close, warm_up, count) < most_mb
 
 
 def test_three_hundred_big_scenes_leave_it_as_it_was():
@@ -57,21 +63,4 @@ def test_three_hundred_big_scenes_leave_it_as_it_was():
         for seed in range(count):
             make_scene("poles", np.random.default_rng(seed), num_obstacles=300, last_y_m=1000.0)
 
-    scenes(50)
-    before = resident_mb()
-    scenes(300)
-    assert resident_mb() - before < 3.0
-
-
-def test_twelve_opengl_contexts_that_are_closed_leave_it_as_it_was():
-    def draw(count):
-        for seed in range(count):
-            env = CorridorEnv(renderer="pyrender", camera=SMALL)
-            env.reset(seed=seed)
-            env.step(0)
-            env.close()
-
-    draw(6)
-    before = resident_mb()
-    draw(12)
-    assert resident_mb() - before < 12.0
+    assert grown_mb(scenes, 50, 300) < 3.0

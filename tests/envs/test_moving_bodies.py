@@ -1,7 +1,5 @@
 """Laws of bodies that move: their events and contacts, balls that are thrown, a planner that knows."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
@@ -13,7 +11,6 @@ from envs.raycast import RaycastRenderer
 from envs.raycast.silhouettes import Way
 from envs.scene import BOX, CONE, ELLIPSOID, OBSTACLE, POLE, Scene, at_velocity
 from envs.scene.collision import first_moving_contact
-from envs.scene.moving import MovingBody
 from envs.scene.paths import moving_sections
 from envs.sensor import Sensor, sense_way
 from envs.vehicles.planning import Planner
@@ -38,15 +35,6 @@ BALLS = {
 }  # fmt: skip
 
 
-def standing(bodies, offset_m=0.0):
-    """Bodies as moving ones that rest."""
-    found = []
-    for body in bodies:
-        place = np.array([[body["x"], body["y"] + offset_m, body["z"]]])
-        found.append(MovingBody(body, np.zeros(1), place))
-    return tuple(found)
-
-
 def seen(scene, velocity_mps, steps=8):
     """Events of a camera that flies at a velocity (x, y) for some steps, by the compiled look."""
     config = EnvConfig(speed_mps=SPEED_MPS, control_hz=1e6 / STEP_US, camera=CAMERA)
@@ -64,27 +52,27 @@ def seen(scene, velocity_mps, steps=8):
     return np.concatenate(found)
 
 
-@pytest.mark.parametrize("kind", [POLE, CONE, ELLIPSOID, BOX])
-def test_a_body_that_comes_nearer_gives_the_events_of_a_camera_that_flies_towards_it(kind):
-    bodies = BODIES[BODIES["kind"] == kind]
-    flown = seen(Scene("one", bodies, **WALLS), (0.0, SPEED_MPS))
-    moving = tuple(at_velocity(body, (0.0, -SPEED_MPS, 0.0)) for body in bodies)
+def test_bodies_that_come_nearer_give_the_events_of_a_camera_that_flies_towards_them():
+    flown = seen(Scene("one", BODIES, **WALLS), (0.0, SPEED_MPS))
+    moving = tuple(at_velocity(body, (0.0, -SPEED_MPS, 0.0)) for body in BODIES)
     rested = seen(Scene("one", NOTHING, moving=moving, **WALLS), (0.0, 0.0))
-    assert flown.size > 50
+    assert flown.size > 200
     assert event_error(flown, rested, 2.0) < 0.01  # the same but for rounding
 
 
 def test_bodies_that_rest_give_the_bytes_of_obstacles():
-    still, rest = Scene("one", BODIES, **WALLS), Scene("one", NOTHING, moving=standing(BODIES), **WALLS)
+    resting = tuple(at_velocity(body, (0.0, 0.0, 0.0)) for body in BODIES)
+    still, rest = Scene("one", BODIES, **WALLS), Scene("one", NOTHING, moving=resting, **WALLS)
     assert np.array_equal(seen(still, (0.5, SPEED_MPS)), seen(rest, (0.5, SPEED_MPS)))
 
 
 def test_a_picture_shows_bodies_where_they_are_then():
-    moving = tuple(at_velocity(body, (0.5, -2.0, 0.0), end_s=10.0) for body in BODIES)
+    moving = tuple(at_velocity(body, (0.5, -2.0, 0.4), end_s=10.0) for body in BODIES)
     renderer = RaycastRenderer(Scene("one", NOTHING, moving=moving), 64, 48)
     later = BODIES.copy()
     later["x"] += 0.75
     later["y"] -= 3.0
+    later["z"] += 0.6
     expected = RaycastRenderer(Scene("one", later), 64, 48).render(0.0, 0.0, 2.0)
     assert np.abs(renderer.render(0.0, 0.0, 2.0, t_s=1.5) - expected).max() < 1e-6
     with pytest.raises(ValueError, match="cannot draw bodies that move"):
@@ -94,7 +82,7 @@ def test_a_picture_shows_bodies_where_they_are_then():
 def test_contact_is_where_a_fine_search_finds_it():
     rng, shares = np.random.default_rng(2), np.linspace(0.0, 1.0, 20_001)
     hits = 0
-    for _ in range(200):
+    for _ in range(80):
         ax, ay, bx, by, x, y = rng.uniform(-3.0, 3.0, 6)
         section = np.array([[x, y, 1.0, 0.0, 0.0, 0.0, 0.4, *rng.uniform(-4.0, 4.0, 2)]])
         found = first_moving_contact((ax, ay, bx, by), 0.3, section, (0.25, 1.0))
@@ -107,7 +95,7 @@ def test_contact_is_where_a_fine_search_finds_it():
             assert found == pytest.approx(shares[touching.argmax()], abs=1e-4)
         else:
             assert found > 1.0 or np.hypot(*(own - other)).min() < 0.7 + 1e-4
-    assert 30 < hits < 170
+    assert 12 < hits < 68
 
 
 def test_sections_are_those_at_the_height_of_the_vehicle():
@@ -127,12 +115,13 @@ def flown(seed, choose, **settings):
             return info
 
 
-def test_a_thrown_ball_hits_who_flies_straight_on():
+@pytest.mark.parametrize("vehicle", [{}, {"vehicle": "kinematic", "body": {}, "observation": "window"}])
+def test_a_thrown_ball_hits_who_flies_straight_on(vehicle):
     for seed in range(3):
-        env = CorridorEnv(**BALLS)
+        env = CorridorEnv(**BALLS | vehicle)
         env.reset(seed=seed)
         first = env.scene.throws.throws[0]
-        info = flown(seed, lambda env: env.dynamics.straight)
+        info = flown(seed, lambda env: env.dynamics.straight, **vehicle)
         assert info["collision"]
         due_s = first.t_s + (env.scene.throws.distance_m - 0.4) / first.speed_mps
         assert 1e-6 * info["t_us"] == pytest.approx(due_s, abs=0.021)
@@ -161,30 +150,12 @@ def test_a_planner_that_knows_dodges(layout):
     assert sum(info["success"] for info in straight) <= 3 < dodged
 
 
-def windows(**settings):
-    """The windows of a flight straight on, up to its end."""
-    env, shown, over = CorridorEnv(**{**BALLS, "observation": "window", **settings}), [], False
-    env.reset(seed=1)
-    while not over:
-        window, _, terminated, truncated, _ = env.step(env.dynamics.straight)
-        shown.append(window[: window[0, 0] + 1])
-        over = terminated or truncated
-    return np.concatenate(shown), terminated
-
-
-@pytest.mark.parametrize("vehicle", [{}, {"vehicle": "kinematic", "body": {}}])
-def test_the_same_seed_gives_the_same_bytes_and_every_vehicle_is_hit(vehicle):
-    (one, hit), (other, _) = (windows(**vehicle) for _ in range(2))
-    assert hit
-    assert np.array_equal(one, other)
-
-
 def test_settings_that_do_not_fit_are_refused():
     for layout, rule in (
         ({"throw_every_s": 0.05}, "throw_every_s must be 0 or"),
         ({"throw_radius_m": 6.0}, "throw_radius_m must be > 0 and < throw_distance_m"),
         ({"num_moving": 0.5}, "num_moving must be a whole number"),
     ):
-        env = CorridorEnv(dataclasses.replace(EnvConfig(), layout=layout))
+        env = CorridorEnv(layout=layout)
         with pytest.raises(ValueError, match=rule):
             env.reset(seed=0)

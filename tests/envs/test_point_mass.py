@@ -10,11 +10,8 @@ from scipy.integrate import solve_ivp
 
 from envs.config import EnvConfig
 from envs.corridor import CorridorEnv, CorridorVectorEnv
-from envs.fidelity import plan_renders
 from envs.vehicles.dynamics import make_dynamics, parts_of_step, planned_config
 from envs.vehicles.point_mass import PointMass, move
-
-BLIND = {"observation": "none", "layout": {"num_obstacles": 0}, "vehicle": "point_mass"}
 
 
 def vehicle(speed_mps=10.0, **body):
@@ -53,10 +50,7 @@ def solved(body: PointMass, state, command, seconds):
 
 
 @pytest.mark.parametrize("command", ["velocity", "acceleration"])
-@pytest.mark.parametrize(
-    "body",
-    [{}, {"drag_per_s": 0.3, "wind_x_mps": 3.0}, {"drag_per_s": 2.0, "mass_ratio": 1.3, "wind_y_mps": -8.0}],
-)
+@pytest.mark.parametrize("body", [{}, {"drag_per_s": 2.0, "mass_ratio": 1.3, "wind_y_mps": -8.0}])
 def test_it_flies_as_a_solver_of_the_equations_says(command, body):
     settings = PointMass(command=command, **body)
     dynamics, rng = vehicle(command=command, **body), np.random.default_rng(0)
@@ -69,27 +63,12 @@ def test_it_flies_as_a_solver_of_the_equations_says(command, body):
     np.testing.assert_allclose(ours[:4], theirs[:4], atol=1e-6 if exact else 1e-4)
 
 
-@pytest.mark.parametrize("command", ["velocity", "acceleration"])
-def test_without_drag_one_long_step_is_a_thousand_short_ones(command):
-    dynamics = vehicle(command=command)
-    long = moved(dynamics, [(0.7, -0.5)], 2.0)[-1]
-    short = moved(dynamics, [(0.7, -0.5)] * 1000, 0.002)[-1]
-    np.testing.assert_allclose(long[:4], short[:4], rtol=1e-9, atol=1e-9)
-
-
 def test_free_motion_is_uniform_and_drag_takes_energy_exponentially():
     free = moved(vehicle(command="acceleration"), [(0, 0)] * 100, 0.05)
     assert free[-1][:4] == pytest.approx([0.0, 50.0, 0.0, 10.0], abs=1e-12)
     slowed = moved(vehicle(command="acceleration", drag_per_s=0.5), [(0, 0)] * 100, 0.02)
     energy = 0.5 * (slowed[:, 2:4] ** 2).sum(axis=1)
     np.testing.assert_allclose(energy, 50.0 * np.exp(-2 * 0.5 * 0.02 * np.arange(101)), rtol=1e-12)
-
-
-def test_it_hovers_where_it_is_and_drifts_at_last_with_the_wind():
-    still = moved(vehicle(), [(0, 0)] * 50, 0.1, np.zeros(6))
-    assert not still.any()
-    drifting = vehicle(command="acceleration", drag_per_s=1.0, wind_x_mps=4.0)
-    assert moved(drifting, [(0, 0)] * 400, 0.1, np.zeros(6))[-1][2] == pytest.approx(4.0)
 
 
 def test_accelerations_and_speeds_stay_within_their_limits():
@@ -104,75 +83,26 @@ def test_accelerations_and_speeds_stay_within_their_limits():
             assert np.hypot(states[:, 2], states[:, 3]).max() <= 15.0 * (1 + 1e-9)
 
 
-def test_the_command_is_reached_with_the_time_constant():
-    states = moved(vehicle(tau_s=0.2), [(0, 12 / 30)], 0.2)
-    assert states[-1][3] == pytest.approx(12.0 - 2.0 / math.e)
-
-
 def test_primitives_are_sideways_commands_and_their_middle_flies_straight():
-    dynamics = make_dynamics(EnvConfig(vehicle="point_mass", speed_mps=10.0, body={"primitives": 11.0}))
+    dynamics = vehicle(primitives=11.0)
     assert dynamics.action_space == spaces.Discrete(11)
     assert dynamics.commands[:, 0] * 30.0 == pytest.approx(np.linspace(-5, 5, 11))
     assert dynamics.commands[:, 1] * 30.0 == pytest.approx(10.0)
-    three = make_dynamics(EnvConfig(vehicle="point_mass", speed_mps=10.0, body={"primitives": 3.0}))
+    three = vehicle(primitives=3.0)
     assert three.commands[:, 0] * 30.0 == pytest.approx([0.0, -5.0, 5.0])  # as the kinematic vehicle's
-    assert three.straight == 0
-    env = CorridorEnv(EnvConfig(**BLIND, speed_mps=10.0, body={"primitives": 11.0}))
-    env.reset(seed=1)
-    x_m = env.camera_pose()[0]
-    for _ in range(20):
-        env.step(int(dynamics.straight))
-    assert env.camera_pose()[:2] == pytest.approx((x_m, 1.0))
-
-
-def test_a_mirrored_command_flies_the_mirrored_way():
-    dynamics = vehicle(drag_per_s=0.4)
-    commands = np.random.default_rng(5).uniform(-1, 1, (50, 2))
-    one, other = moved(dynamics, commands, 0.02), moved(dynamics, commands * (-1, 1), 0.02)
-    np.testing.assert_array_equal(one * (-1, 1, -1, 1, -1, 1), other)
-
-
-@pytest.mark.parametrize("delay_ms", [0.0, 50.0, 100.0])
-def test_commands_wait_as_long_as_the_delay_whatever_the_rate(delay_ms):
-    for control_hz in (100.0, 200.0):
-        env = CorridorEnv(EnvConfig(**BLIND, speed_mps=10.0, control_hz=control_hz, action_delay_ms=delay_ms))
-        env.reset(seed=0)
-        x_m, first = env.camera_pose()[0], None
-        for step in range(int(0.2 * control_hz)):
-            place = env.place_of_action()
-            env.step(np.array([1.0, 0.0], np.float32))
-            if first is None and env.camera_pose()[0] != x_m:
-                first = step
-            assert place[1] - env.camera_pose()[1] <= 10.0 * (delay_ms * 1e-3 + 1e-9)
-        assert first == round(delay_ms * 1e-3 * control_hz)
-
-
-def test_where_the_next_decision_acts_is_where_the_vehicle_is_once_it_acts():
-    env = CorridorEnv(EnvConfig(**BLIND, speed_mps=10.0, control_hz=100.0, action_delay_ms=50.0))
-    env.reset(seed=0)
-    rng = np.random.default_rng(0)
-    for _ in range(10):
-        env.step(rng.uniform(-1, 1, 2))
-    expected = env.place_of_action()
-    for _ in range(5):
-        env.step(rng.uniform(-1, 1, 2))
-    assert env.camera_pose()[:2] == pytest.approx(expected, abs=1e-12)
+    assert (three.straight, dynamics.straight) == (0, 5)
 
 
 def test_the_clock_counts_steps_and_the_renders_are_planned_for_the_highest_speed():
     config = EnvConfig(vehicle="point_mass", speed_mps=10.0, control_hz=20.0)
-    dynamics, scene = make_dynamics(config), CorridorEnv()
-    scene.reset(seed=0)
     assert parts_of_step(config) == 5
-    planned = planned_config(config, dynamics)
+    planned = planned_config(config, make_dynamics(config))
     assert (planned.speed_mps, planned.control_hz) == (30.0, 100.0)
     kinematic = dataclasses.replace(config, vehicle="kinematic")
     assert planned_config(kinematic, make_dynamics(kinematic)) is kinematic
-    assert plan_renders(planned, scene.scene).max_step_m > 10.0 / 100.0 * (1 + 1e-3)
     env = CorridorEnv(config)
     env.reset(seed=0)
-    clocks = [env.step(np.zeros(2))[4]["t_us"] for _ in range(3)]
-    assert clocks == [50_000, 100_000, 150_000]
+    assert [env.step(np.zeros(2))[4]["t_us"] for _ in range(3)] == [50_000, 100_000, 150_000]
 
 
 def test_a_body_a_little_faster_than_its_nominal_speed_needs_no_second_image():
@@ -185,49 +115,6 @@ def test_a_body_a_little_faster_than_its_nominal_speed_needs_no_second_image():
             env.step(action)
         renders.append(env._vehicles.rows["renders"][0])
     assert renders[1] < 1.2 * renders[0]
-
-
-def test_standing_flying_back_and_sideways_end_no_episode_early_and_see_events():
-    for action in ((0.0, 0.0), (0.0, -1.0), (0.3, 0.0)):
-        env = CorridorEnv(EnvConfig(vehicle="point_mass", speed_mps=2.0, control_hz=100.0))
-        env.reset(seed=0)
-        for _ in range(60):
-            _, reward, terminated, _, info = env.step(np.array(action))
-            assert not terminated
-            assert math.isfinite(reward)
-        assert (info["num_events"] > 0) == (action != (0.0, 0.0))
-
-
-def test_vehicles_side_by_side_fly_as_each_alone_to_the_byte():
-    config = EnvConfig(vehicle="point_mass", speed_mps=10.0, control_hz=50.0, body={"drag_per_s": 0.3})
-    vector, rng = CorridorVectorEnv(2, config, action_delay_ms=40.0), np.random.default_rng(0)
-    singles = [CorridorEnv(config, action_delay_ms=40.0) for _ in range(2)]
-    vector.reset(seed=[3, 4])
-    for env, seed in zip(singles, (3, 4), strict=True):
-        env.reset(seed=seed)
-    assert vector.action_space.shape == (2, 2)
-    for _ in range(12):
-        actions = rng.uniform(-1, 1, (2, 2)).astype(np.float32)
-        vector.step(actions)
-        for env, single, action in zip(vector.envs, singles, actions, strict=True):
-            single.step(action)
-            assert env.events.tobytes() == single.events.tobytes()
-            assert env.camera_pose() == single.camera_pose()
-
-
-def test_settings_drawn_for_an_episode_are_flown_in_it():
-    def draw(config, rng):
-        return dataclasses.replace(config, body={"drag_per_s": 1.0, "wind_x_mps": float(rng.uniform(2, 6))})
-
-    env, drifts = CorridorEnv(EnvConfig(**BLIND, speed_mps=10.0), draw=draw), []
-    for episode in range(3):
-        env.reset(seed=episode)
-        x_m = env.camera_pose()[0]
-        for _ in range(20):
-            env.step(np.array([0.0, 1 / 3]))
-        drifts.append(env.camera_pose()[0] - x_m)
-    assert len(set(drifts)) == 3
-    assert min(drifts) > 0.0
 
 
 def test_a_replay_of_continuous_actions_has_the_same_bytes():
@@ -268,18 +155,17 @@ def test_the_preset_is_a_crazyflie_of_its_sources():
     assert drag == pytest.approx(1.02506e-6 * rotors / mass, rel=5e-3)
 
 
-@pytest.mark.parametrize("wind_mps", [0.0, 1.0])
-def test_a_quadrotor_of_rotorpy_settles_where_the_point_mass_does(wind_mps):
+def test_a_quadrotor_of_rotorpy_settles_where_the_point_mass_does_in_wind():
     """RotorPy 3.0's Crazyflie has an attitude and motors; its velocity controller gets our time constant."""
     vehicles = pytest.importorskip("rotorpy.vehicles.multirotor", reason="needs: pip install rotorpy")
     from rotorpy.vehicles.crazyflie_params import quad_params
 
-    ours = make_dynamics(EnvConfig(vehicle="crazyflie", speed_mps=3.0, body={"wind_x_mps": wind_mps}))
+    ours = make_dynamics(EnvConfig(vehicle="crazyflie", speed_mps=3.0, body={"wind_x_mps": 1.0}))
     tau_s = 0.219  # of `make_crazyflie`
     hover = math.sqrt(quad_params["mass"] * 9.81 / 4 / quad_params["k_eta"])
     start = {name: np.zeros(3) for name in ("x", "v", "w")} | {
         "q": np.array([0.0, 0.0, 0.0, 1.0]),
-        "wind": np.array([wind_mps, 0.0, 0.0]),
+        "wind": np.array([1.0, 0.0, 0.0]),
         "rotor_speeds": np.full(4, hover),
     }
     quadrotor = vehicles.Multirotor(

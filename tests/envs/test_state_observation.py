@@ -44,7 +44,7 @@ def test_noise_has_its_size_and_depends_on_the_episode_alone():
 
     def states():
         env.reset(seed=4)
-        return np.array([env.step(ahead)[0]["state"] for _ in range(200)])
+        return np.array([env.step(ahead)[0]["state"] for _ in range(100)])
 
     first = states()
     assert np.array_equal(first, states())
@@ -54,8 +54,6 @@ def test_noise_has_its_size_and_depends_on_the_episode_alone():
 def test_checkers_and_learners_of_other_libraries_take_it():
     check_gymnasium(make(), skip_render_check=True)
     check_sb3(make())
-    vector = gymnasium.vector.SyncVectorEnv([make, make])
-    assert vector.reset(seed=0)[0]["state"].shape == (2, 4)
     PPO("MultiInputPolicy", make(), n_steps=16, batch_size=8, n_epochs=1, device="cpu").learn(16)
     SAC("MultiInputPolicy", make(), buffer_size=64, learning_starts=8, batch_size=8, device="cpu").learn(16)
 
@@ -76,9 +74,3 @@ def test_the_wrappers_of_cleanrl_for_continuous_actions_take_a_vector_of_it():
         assert np.isfinite(rewards).all()
         assert ("episode" in infos) == truncated.any()
     assert ended == 2
-
-
-def test_the_specs_of_torchrl_hold():
-    gym = pytest.importorskip("torchrl.envs.libs.gym", reason="needs torchrl, which no extra installs")
-    utils = pytest.importorskip("torchrl.envs.utils")
-    utils.check_env_specs(gym.GymWrapper(make()))

@@ -71,33 +71,33 @@ def flown(actions, **fields):
     return np.concatenate(events), np.array(told, float)
 
 
-def test_headings_through_the_seam_fly_and_see_as_the_kinematic_vehicle():
-    actions = np.random.default_rng(1).integers(0, 3, 60)
-    events, told = flown(actions)
-    others, other = flown(actions, vehicle="headings")
+@pytest.mark.parametrize("delay_ms", [0.0, 12.0])
+def test_headings_through_the_seam_fly_and_see_as_the_kinematic_vehicle(delay_ms):
+    actions = np.random.default_rng(1).integers(0, 3, 40)
+    events, told = flown(actions, action_delay_ms=delay_ms)
+    others, other = flown(actions, action_delay_ms=delay_ms, vehicle="headings")
     np.testing.assert_allclose(other, told, atol=1e-9)
-    assert len(others) == len(events) > 1000
+    assert len(others) == len(events) > 500
     assert (others[["x", "y", "p"]] == events[["x", "y", "p"]]).mean() > 0.99
 
 
 def test_kinematic_vehicles_and_others_fly_side_by_side_as_each_alone():
-    configs = [EnvConfig(vehicle=name) for name in ("kinematic", "headings", "kinematic")]
+    body = {"primitives": 3, "drag_per_s": 0.3}
+    configs = [
+        EnvConfig(),
+        EnvConfig(vehicle="headings"),
+        EnvConfig(vehicle="point_mass", action_delay_ms=40.0, body=body),
+    ]
     vector, singles = CorridorVectorEnv(3, configs), [CorridorEnv(config) for config in configs]
     vector.reset(seed=[1, 2, 3])
     for seed, env in enumerate(singles, 1):
         env.reset(seed=seed)
-    for actions in np.random.default_rng(0).integers(0, 3, (20, 3)):
+    for actions in np.random.default_rng(0).integers(0, 3, (12, 3)):
         vector.step(actions)
         for one, env, action in zip(vector.envs, singles, actions, strict=True):
             env.step(action)
             assert one.camera_pose() == env.camera_pose()
             assert one.events.tobytes() == env.events.tobytes()
-
-
-def test_delayed_headings_fly_as_the_delayed_kinematic_vehicle():
-    actions = np.random.default_rng(2).integers(0, 3, 30)
-    both = [flown(actions, action_delay_ms=12.0, **vehicle)[1] for vehicle in ({}, {"vehicle": "headings"})]
-    np.testing.assert_allclose(*both, atol=1e-9)
 
 
 def test_a_box_of_commands_is_queued_and_checked():
@@ -115,11 +115,12 @@ def test_a_box_of_commands_is_queued_and_checked():
             env.step(wrong)
 
 
-def test_standing_and_flying_back_earn_their_way_and_reach_no_goal():
+def test_standing_and_flying_back_earn_their_way_reach_no_goal_and_see_what_moves():
     for speed in (0.0, -10.0):
-        told = flown([np.array([0.0, speed])] * 10, vehicle="displaced", layout=EMPTY)[1]
+        events, told = flown([np.array([0.0, speed])] * 10, vehicle="displaced")
         assert told[:, 2] == pytest.approx(speed / 200.0)
         assert not told[:, 3].any()
+        assert (events.size > 0) == (speed != 0.0)
 
 
 def test_a_way_of_several_parts_stops_where_its_first_part_does():

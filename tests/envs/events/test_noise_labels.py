@@ -41,8 +41,12 @@ FIELDS = [
 ]
 
 
-@pytest.mark.parametrize("fields", FIELDS)
-@pytest.mark.parametrize("frames_hz", [60, 240])
+each_kind_of_pixel = pytest.mark.parametrize(
+    ("frames_hz", "fields"), [(240, {}), *((60, row) for row in FIELDS)]
+)
+
+
+@each_kind_of_pixel
 def test_hardly_any_event_of_a_moving_scene_is_due_to_hardly_any_noise(fields, frames_hz):
     """Though nearly a third of them come a little early, as noise lets pixels cross their next level."""
     events, is_noise = sensed(FaultsConfig(shot_noise_hz=0.001), frames_hz, **fields)
@@ -50,8 +54,7 @@ def test_hardly_any_event_of_a_moving_scene_is_due_to_hardly_any_noise(fields, f
     assert is_noise.mean() < 0.01
 
 
-@pytest.mark.parametrize("fields", FIELDS)
-@pytest.mark.parametrize("frames_hz", [60, 240])
+@each_kind_of_pixel
 def test_where_the_light_rests_all_events_are_noise(fields, frames_hz):
     faults = FaultsConfig(shot_noise_hz=5.0, leak_hz=2.0, leak_jitter=0.1, noise_spread=0.1)
     events, is_noise = sensed(faults, frames_hz, 0.0, **fields)
@@ -59,7 +62,7 @@ def test_where_the_light_rests_all_events_are_noise(fields, frames_hz):
     assert is_noise.all()
 
 
-@pytest.mark.parametrize("frames_hz", [60, 240, 600])
+@pytest.mark.parametrize("frames_hz", [60, 240])
 def test_of_a_level_that_leaks_as_many_events_are_noise_as_the_noiseless_pixel_does_not_fire(frames_hz):
     """More ON events while the light rises; while it falls, leakage takes OFF events away."""
     events, is_noise = sensed(FaultsConfig(leak_hz=5.0, leak_jitter=0.0), frames_hz)
@@ -73,7 +76,7 @@ def test_of_a_level_that_leaks_as_many_events_are_noise_as_the_noiseless_pixel_d
 @pytest.mark.parametrize("pixels_per_s", [6.0, 48.0])
 def test_the_share_of_noise_does_not_depend_on_the_frame_rate(pixels_per_s):
     faults = FaultsConfig(shot_noise_hz=5.0, leak_hz=0.5)
-    shares = [sensed(faults, frames_hz, pixels_per_s)[1].mean() for frames_hz in (240, 480, 960)]
+    shares = [sensed(faults, frames_hz, pixels_per_s)[1].mean() for frames_hz in (240, 720)]
     assert min(shares) > 0.02
     assert max(shares) < 1.2 * min(shares)
 
@@ -101,7 +104,7 @@ def test_labels_change_no_event():
     )
     for fields in FIELDS:
         plain, labelled = (
-            sensed(faults, 120, seconds=0.2, labels=labels, **fields) for labels in (False, True)
+            sensed(faults, 60, seconds=0.2, labels=labels, **fields) for labels in (False, True)
         )
         assert plain[0].tobytes() == labelled[0].tobytes()
         assert labelled[0].shape == labelled[1].shape

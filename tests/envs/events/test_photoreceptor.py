@@ -1,5 +1,3 @@
-import math
-
 import mpmath
 import numpy as np
 import pytest
@@ -14,42 +12,29 @@ from envs.events.photoreceptor import (
     response_curve,
 )
 
+each_response = pytest.mark.parametrize("response", ["log", "lin_log"])
+
 
 def room(values):
     return np.empty(values.size, np.int64)
 
 
-def response_of(luminance, name, floor):
-    if name == "log":
-        return math.log(luminance + floor)
-    return math.log(luminance) if luminance > floor else luminance / floor - 1.0 + math.log(floor)
-
-
-@pytest.mark.parametrize("floor", [1e-6, 1e-3, 0.1, 1.0])
-def test_the_linear_part_of_a_response_joins_the_logarithm_without_a_kink(floor):
-    curve = response_curve("lin_log", floor)
-    offset = np.array([-2e-3, -1e-3, 0.0, 1e-3, 2e-3])
-    levels = np.empty(5)
-    respond(curve, (floor * (1 + offset)).astype(np.float32), levels, room(levels))
-    slopes = np.diff(levels) / 1e-3  # in units of 1 / floor
-    assert np.abs(slopes - 1.0).max() < 3e-3
-    assert levels[2] == pytest.approx(math.log(floor), abs=1e-6)
-
-
-@pytest.mark.parametrize("response", ["log", "lin_log"])
-def test_a_response_and_its_light_undo_each_other(response):
-    curve = response_curve(response, 1e-3)
+@each_response
+@pytest.mark.parametrize("floor", [1e-6, 1e-3, 1.0])
+def test_a_response_is_its_formula_and_its_light_undoes_it(response, floor):
+    curve = response_curve(response, floor)
     light = np.concatenate(([0.0], np.geomspace(1e-7, 1e38, 500))).astype(np.float32)
-    levels = np.empty(light.size)
+    levels, exact = np.empty(light.size), light.astype(np.float64)
     respond(curve, light, levels, room(levels))
-    truth = [response_of(float(v), response, 1e-3) for v in light]
+    truth = np.log(exact + floor)
+    if response == "lin_log":
+        truth = np.where(exact > floor, np.log(np.maximum(exact, floor)), exact / floor - 1.0 + np.log(floor))
     assert np.abs(levels - truth).max() < 1e-13
     light_of(curve, levels, room(levels))
-    assert np.abs(levels - light).max() <= 1e38 * 1e-11
-    assert (np.abs(levels - light) <= 1e-11 * (light + 1e-3)).all()
+    assert (np.abs(levels - light) <= 1e-11 * (light + floor)).all()
 
 
-@pytest.mark.parametrize("response", ["log", "lin_log"])
+@each_response
 def test_light_is_by_our_own_exponential_and_the_same_on_every_machine(response):
     curve = response_curve(response, 1e-3)
     levels = np.random.default_rng(0).permutation(np.linspace(-9.0, 88.0, 1000))  # the knee is at -6.9
@@ -74,41 +59,24 @@ def test_eight_bits_round_light_as_the_formula_has_it(encoding, gamma):
         assert events.tobytes() == plain.step(rounded[k], 1000 * k).tobytes() != b""
 
 
-def test_eight_bits_refuse_what_is_no_light_and_change_nothing():
-    cameras = [EventCamera(2, 1, encoding="gamma8") for _ in range(2)]
-    for camera in cameras:
-        camera.reset(np.float32([[0.1, 0.2]]), 0)
-    for bad in (np.nan, np.inf, -0.1):
-        with pytest.raises(ValueError, match="x=1, y=0"):
-            cameras[0].step(np.float32([[0.9, bad]]), 1000)
-    last = np.float32([[0.9, 0.1]])
-    assert cameras[0].step(last, 1000).tobytes() == cameras[1].step(last, 1000).tobytes() != b""
-
-
-def ulps(ours, truth):
-    """Largest error in units in the last place of the result."""
-    return max(
-        float(abs(mpmath.mpf(o) - t) / np.spacing(abs(float(t)) or 1e-300))
-        for o, t in zip(ours, truth, strict=True)
-    )
-
-
 def test_the_logarithm_is_within_one_ulp_of_the_true_one():
     rng = np.random.default_rng(0)
     single = np.concatenate(
-        (np.geomspace(1e-45, MAX_LUMINANCE, 1500), rng.random(500), [1e-45, 1.0, MAX_LUMINANCE])
+        (np.geomspace(1e-45, MAX_LUMINANCE, 500), rng.random(200), [1e-45, 1.0, MAX_LUMINANCE])
     )
-    near_one = 1.0 + np.concatenate((np.geomspace(1e-16, 0.3, 300), -np.geomspace(1e-16, 0.3, 300)))
+    near_one = 1.0 + np.concatenate((np.geomspace(1e-16, 0.3, 150), -np.geomspace(1e-16, 0.3, 150)))
     values = np.concatenate([single.astype(np.float32) + floor for floor in (1e-9, 1e-3, 1.0)] + [near_one])
     values = values.astype(np.float64)
     logs = values.copy()
     natural_logarithm(logs, room(logs))
     with mpmath.workdps(40):
-        assert ulps(logs, [mpmath.log(mpmath.mpf(v)) for v in values]) < 1.0
+        for ours, value in zip(logs, values, strict=True):
+            truth = mpmath.log(mpmath.mpf(value))
+            assert abs(mpmath.mpf(ours) - truth) < np.spacing(abs(float(truth)) or 1e-300)
 
 
 def test_the_exponential_is_exact_enough_for_the_quiet_band():
-    values = np.linspace(-110.0, 110.0, 2001)
+    values = np.linspace(-110.0, 110.0, 701)
     results = values.copy()
     exponential(results, room(results))
     with mpmath.workdps(40):

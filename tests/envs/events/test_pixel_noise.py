@@ -16,14 +16,16 @@ from envs.events.ramps import ColumnCamera
 SECOND = 10**6
 
 
-def still(seconds, step_us, light=0.0, shape=(16, 16), seed=0, camera=None, **faults):
+def sensor_of(eye, config, seed=0, **faults):
+    return RealSensor(config, FaultsConfig(**faults), (eye.state, eye.pixels), np.random.default_rng(seed), 0)
+
+
+def still(seconds, step_us, light=0.0, shape=(16, 16), camera=None, **faults):
     """Events of a sensor in front of a still picture."""
     config = CameraConfig(width=shape[1], height=shape[0], **(camera or {}))
     eye, picture = EventCamera(config), np.full(shape, light, np.float32)
     eye.reset(picture, 0)
-    state = eye.state, eye.pixels
-    real = RealSensor(config, FaultsConfig(**faults), state, np.random.default_rng(seed), 0)
-    parts = []
+    real, parts = sensor_of(eye, config, **faults), []
     for t in range(0, round(seconds * SECOND), step_us):
         parts.append(real.events(eye.step(picture, t + step_us), t, t + step_us))
         assert ((parts[-1]["t"] > t) & (parts[-1]["t"] <= t + step_us)).all()
@@ -39,7 +41,7 @@ def by_pixel(events, width=16):
 
 
 def test_passage_and_return_times_are_those_of_siegert():
-    for sigmas in (0.25, 1.0, 2.5, 5.0, 8.0):
+    for sigmas in (0.25, 2.5, 8.0):
         k = round(sigmas * PER_SIGMA)
         up = math.sqrt(2 * math.pi) * quad(lambda y: math.exp(y * y / 2) * norm.cdf(y), 0, sigmas)[0]
         back = math.sqrt(2 * math.pi) * quad(lambda y: math.exp(y * y / 2) * norm.cdf(-y), 0, sigmas)[0]
@@ -63,25 +65,26 @@ def test_the_rate_is_that_of_the_process_simulated_in_small_steps():
     assert threshold_in_sigmas(mean_rate(sigmas)) == pytest.approx(sigmas, abs=1e-6)
 
 
-@pytest.mark.parametrize("step_us", [1000, 5000, 200_000])
-def test_shot_noise_has_its_rate_alternates_and_does_not_drift(step_us):
-    events = still(2, step_us, shape=(64, 64), camera={"cutoff_hz": 30.0}, shot_noise_hz=5.0)
-    assert len(events) / 4096 / 2 == pytest.approx(5.0, rel=0.1)  # pixels differ by where their level stands
-    pixels = by_pixel(events, 64)
-    assert max(abs(int(p.astype(int).sum())) for _, p in pixels) <= 2
-    changes = np.concatenate([p[1:] != p[:-1] for _, p in pixels])
-    assert changes.mean() > 0.995
+def test_shot_noise_has_its_rate_alternates_and_does_not_drift_whatever_the_step():
+    gaps = []
+    for step_us in (4000, 200_000):
+        events = still(2, step_us, shape=(48, 48), camera={"cutoff_hz": 30.0}, shot_noise_hz=5.0)
+        assert len(events) / 48**2 / 2 == pytest.approx(5.0, rel=0.1)  # pixels differ by where their level is
+        pixels = by_pixel(events, 48)
+        assert max(abs(int(p.astype(int).sum())) for _, p in pixels) <= 2
+        changes = np.concatenate([p[1:] != p[:-1] for _, p in pixels])
+        assert changes.mean() > 0.995
+        gaps.append(np.concatenate([np.diff(t) for t, _ in pixels]))
+    assert ks_2samp(*gaps).pvalue > 0.01
 
 
 def test_waiting_goes_on_while_the_light_trembles():
     eye = EventCamera(64, 64, cutoff_hz=1e5)
     lights = [np.full((64, 64), value, np.float32) for value in (0.05, 0.05004)]
-    eye.reset(lights[0], 0)
-    faults, state = FaultsConfig(shot_noise_hz=50.0), (eye.state, eye.pixels)
     counts = []
-    for step_us in (100, 20_000):
+    for step_us in (200, 20_000):
         eye.reset(lights[0], 0)
-        real, count = RealSensor(eye.config, faults, state, np.random.default_rng(0), 0), 0
+        real, count = sensor_of(eye, eye.config, shot_noise_hz=50.0), 0
         for k in range(SECOND // 10 // step_us):
             t = k * step_us
             count += real.events(eye.step(lights[(k + 1) % 2], t + step_us), t, t + step_us).size
@@ -90,24 +93,16 @@ def test_waiting_goes_on_while_the_light_trembles():
     assert counts[0] == pytest.approx(50.0 * (1 - 0.75 * 0.05), rel=0.2)
 
 
-def test_intervals_do_not_depend_on_the_step():
-    gaps = []
-    for step_us in (1000, 100_000):
-        events = still(1.5, step_us, shape=(32, 32), camera={"cutoff_hz": 30.0}, shot_noise_hz=5.0)
-        gaps.append(np.concatenate([np.diff(t) for t, _ in by_pixel(events, 32)]))
-    assert ks_2samp(*gaps).pvalue > 0.01
-
-
 def test_shot_noise_falls_with_the_light_to_a_quarter():
     dark, grey, white, sun = (
-        len(still(20, 200_000, light, shape=(64, 64), shot_noise_hz=1.0)) for light in (0.0, 0.5, 1.0, 40.0)
+        len(still(20, 4_000_000, light, shape=(64, 64), shot_noise_hz=1.0)) for light in (0.0, 0.5, 1.0, 40.0)
     )
     assert grey / dark == pytest.approx(0.625, rel=0.08)
     assert white / dark == pytest.approx(0.25, rel=0.1)
     assert sun == pytest.approx(white, rel=0.1)
 
 
-@pytest.mark.parametrize(("step_us", "refractory_us"), [(1000, 20_000), (30_000, 300)])
+@pytest.mark.parametrize(("step_us", "refractory_us"), [(4000, 20_000), (30_000, 300)])
 def test_a_dead_time_holds_for_noise_and_on_is_as_likely_as_off_then(step_us, refractory_us):
     camera = {"refractory_us": refractory_us, "cutoff_hz": 100.0}
     noise = {"shape": (32, 32), "camera": camera, "shot_noise_hz": 20.0}
@@ -127,14 +122,14 @@ def test_a_dead_time_holds_between_noise_and_light():
     )
     env, parts = CorridorEnv(config), []
     env.reset(seed=1)
-    for _ in range(40):
+    for _ in range(20):
         env.step(0)
         parts.append(env.events)
     events = np.concatenate(parts)
     assert min(int(np.diff(t).min()) for t, _ in by_pixel(events, 24) if t.size > 1) >= 4000
 
 
-@pytest.mark.parametrize("step_us", [5000, 40_000, 4_000_000])
+@pytest.mark.parametrize("step_us", [5000, 4_000_000])
 def test_leakage_is_regular_and_does_not_depend_on_the_step(step_us):
     events = still(4, step_us, leak_hz=7.0)
     assert (events["p"] == 1).all()
@@ -143,7 +138,7 @@ def test_leakage_is_regular_and_does_not_depend_on_the_step(step_us):
     assert np.abs(gaps - SECOND / 7).max() <= 3
 
 
-def test_leakage_jitters_and_spreads_as_asked_on_shot_noise_too():
+def test_leakage_jitters_and_spreads_as_asked():
     events = still(40, 40_000_000, shape=(32, 32), leak_hz=3.0, leak_jitter=0.1, noise_spread=0.1)
     pixels = by_pixel(events, 32)
     means = np.array([np.diff(t).mean() for t, _ in pixels])
@@ -157,8 +152,7 @@ def test_leakage_moves_the_levels_which_then_stand_anywhere_below_the_light():
     """So a step down by 1.5 thresholds fires once in half of the pixels, and by half a threshold nowhere."""
     eye, picture = EventCamera(64, 64), np.ones((64, 64), np.float32)
     eye.reset(picture, 0)
-    faults, state = FaultsConfig(leak_hz=1.0, leak_jitter=0.1), (eye.state, eye.pixels)
-    real = RealSensor(eye.config, faults, state, np.random.default_rng(0), 0)
+    real = sensor_of(eye, eye.config, leak_hz=1.0, leak_jitter=0.1)
     for t in range(0, 2 * SECOND, 20_000):
         real.events(eye.step(picture, t + 20_000), t, t + 20_000)
     assert len(eye.step(picture * np.float32(math.exp(-0.1)), 2 * SECOND + 1)) == 0
@@ -170,11 +164,8 @@ def test_noise_of_a_camera_that_is_looked_through_by_columns_falls_on_its_own_pi
     eye, picture = ColumnCamera(config), np.zeros((16, 32), np.float32)
     picture[:, 8:] = 1.0
     eye.reset(picture)
-    faults = FaultsConfig(shot_noise_hz=20.0, sparsity=0.25)
-    real = RealSensor(config, faults, (eye.state, eye.pixels), np.random.default_rng(0), 0)
-    events = np.concatenate(
-        [real.events(np.empty(0, EVENT), t, t + SECOND) for t in range(0, 20 * SECOND, SECOND)]
-    )
+    real, begins = sensor_of(eye, config, shot_noise_hz=20.0, sparsity=0.25), range(0, 20 * SECOND, SECOND)
+    events = np.concatenate([real.events(np.empty(0, EVENT), t, t + SECOND) for t in begins])
     counts = np.zeros((16, 32))
     np.add.at(counts, (events["y"], events["x"]), 1)
     assert (counts[real._pixels.dead] == 0).all()

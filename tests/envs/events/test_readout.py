@@ -34,7 +34,7 @@ def sent(events, cuts, **fields):
     return np.concatenate(parts), lost, len(readout._waiting)
 
 
-@pytest.mark.parametrize("step_us", [100, 1000, 20_000])
+@pytest.mark.parametrize("step_us", [100, 20_000])
 def test_a_latency_moves_every_event_by_it_across_the_ends_of_steps(step_us):
     events = some_events(2000, 19_000)
     late, lost, waiting = sent(events, range(step_us, 20_001, step_us), latency_us=700)
@@ -55,14 +55,13 @@ def test_jitter_has_its_deviation_and_no_event_comes_before_its_cause():
     assert early["t"].min() >= 10_000
 
 
-@pytest.mark.parametrize("readout_hz", [1e4, 1e5, 1e6])
-@pytest.mark.parametrize("step_us", [50, 20_000])
-def test_no_more_events_leave_than_the_limit_and_none_is_forgotten(readout_hz, step_us):
+@pytest.mark.parametrize("readout_hz", [1e4, 1e6])
+def test_no_more_events_leave_than_the_limit_and_none_is_forgotten(readout_hz):
     events = some_events(3000, 20_000)
-    out, lost, waiting = sent(events, range(step_us, 20_001, step_us), readout_hz=readout_hz)
+    out, lost, waiting = sent(events, range(50, 20_001, 50), readout_hz=readout_hz)
     assert len(out) + lost + waiting == len(events)
     assert len(out) <= readout_hz * 0.02 + SHAPE[1]  # the row that is being sent
-    assert (lost > 0) == (readout_hz < 1e6) or readout_hz == 1e6
+    assert lost > 0 or readout_hz == 1e6
     whole = sent(events, [20_000], readout_hz=readout_hz)
     assert whole[0].tobytes() == out.tobytes()
     assert whole[1:] == (lost, waiting)

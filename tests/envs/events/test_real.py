@@ -72,7 +72,7 @@ def matched(recording, folder):
     times, real = recording[1:3]
     wanted = {sign: sum(np.abs(image[image * sign > 0]).sum() for image in real) for sign in (1, -1)}
     on = off = 0.5
-    for _ in range(20):
+    for _ in range(10):
         camera = CameraConfig(
             width=SHAPE[1], height=SHAPE[0], contrast_threshold=on, contrast_threshold_off=off
         )
@@ -86,26 +86,25 @@ def matched(recording, folder):
 
 
 @pytest.mark.filterwarnings("ignore:.*events are missing:UserWarning")  # 26 frames per second
-@pytest.mark.parametrize("exposed_us", [4000, 8000])
-def test_simulated_events_are_like_those_of_a_real_sensor(recording, exposed_us, tmp_path):
+def test_simulated_events_are_like_those_of_a_real_sensor(recording, tmp_path):
     """With all defaults; a frame is of the middle of its exposure, some milliseconds after its time."""
     lines = (FOLDER / "images.txt").read_text().splitlines()[1:5]
     (tmp_path / "images").mkdir()
     (tmp_path / "images.txt").write_text("\n".join(lines))
     for line in lines:
         shutil.copy(FOLDER / line.split()[1], tmp_path / "images")
-    later = (*recording[:2], between(recording[3], [t + exposed_us for t in recording[1]]))
-    _, blurred, signs, shared = likeness(later, matched(later, tmp_path))
-    assert blurred >= 0.90
-    assert signs >= 0.97
-    assert shared >= 0.45
+    for exposed_us in (4000, 8000):
+        later = (*recording[:2], between(recording[3], [t + exposed_us for t in recording[1]]))
+        _, blurred, signs, shared = likeness(later, matched(later, tmp_path))
+        assert blurred >= 0.90
+        assert signs >= 0.97
+        assert shared >= 0.45
 
 
 @pytest.mark.parametrize(
     ("threshold", "count", "figures"),
     [
         (0.2, 115_027, (0.669, 0.804, 0.950, 0.450)),
-        (0.5, 32_458, (0.638, 0.758, 0.971, 0.351)),
         (0.75, 14_925, (0.592, 0.709, 0.974, 0.253)),
     ],
 )

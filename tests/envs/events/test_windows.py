@@ -8,15 +8,16 @@ from envs.events.windows import pack_windows
 
 PIXELS = st.integers(0, 65535)
 ROWS = st.lists(st.tuples(st.integers(1, 5000), PIXELS, PIXELS, st.sampled_from([-1, 1])), max_size=12)
+NOTHING = np.empty(0, EVENT)
 
 
 def as_events(rows, start_us=0):
-    events = np.array(sorted(rows), EVENT) if rows else np.empty(0, EVENT)
+    events = np.array(sorted(rows), EVENT) if rows else NOTHING.copy()
     events["t"] += start_us
     return events
 
 
-@settings(deadline=None)
+@settings(max_examples=50)
 @given(ROWS, st.integers(-(2**40), 2**40))
 def test_packing_and_unpacking_gives_the_events_back(rows, start_us):
     window = pack_window(as_events(rows, start_us), start_us, 5000, 12)
@@ -36,44 +37,46 @@ def test_over_capacity_the_newest_are_kept_and_the_others_counted():
     assert window[1:, 0].tolist() == [7, 8, 9, 10]
 
 
+def rows_of(*rows):
+    return np.array(list(rows), EVENT)
+
+
 @pytest.mark.parametrize(
-    "rows", [[(0, 1, 1, 1)], [(11, 1, 1, 1)], [(5, 1, 1, 0)], [(5, 1, 1, 1), (4, 1, 1, 1)], [(-3, 1, 1, 1)]]
+    ("events", "window_us", "capacity", "message"),
+    [
+        (rows_of((0, 1, 1, 1)), 10, 4, "event 0"),
+        (rows_of((11, 1, 1, 1)), 10, 4, "event 0"),
+        (rows_of((5, 1, 1, 0)), 10, 4, "event 0"),
+        (rows_of((5, 1, 1, 1), (4, 1, 1, 1)), 10, 4, "event 1"),
+        (NOTHING, 0, 4, "window_us"),
+        (NOTHING, 2**31, 4, "window_us"),
+        (NOTHING, 10, 0, "capacity"),
+        (np.zeros((3, 4)), 10, 4, "EVENT"),
+    ],
 )
-def test_events_out_of_time_order_or_polarity_are_refused(rows):
-    with pytest.raises(ValueError, match=f"event {len(rows) - 1}"):
-        pack_window(np.array(rows, EVENT), 0, 10, 4)
+def test_what_is_no_window_of_events_is_refused(events, window_us, capacity, message):
+    with pytest.raises(ValueError, match=message):
+        pack_window(events, 0, window_us, capacity)
 
 
-@pytest.mark.parametrize(("window_us", "capacity"), [(0, 4), (2**31, 4), (10, 0)])
-def test_a_window_without_length_or_room_is_refused(window_us, capacity):
-    with pytest.raises(ValueError, match="window_us"):
-        pack_window(np.empty(0, EVENT), 0, window_us, capacity)
-
-
-def test_other_arrays_are_refused():
-    with pytest.raises(ValueError, match="EVENT"):
-        pack_window(np.zeros((3, 4)), 0, 10, 4)
-    with pytest.raises(ValueError, match="int32"):
-        unpack_window(np.zeros((3, 4)))
+def test_what_cannot_be_unpacked_is_refused():
     window = np.zeros((3, 4), np.int32)
     window[0, 0] = 3
-    with pytest.raises(ValueError, match="cannot hold 3"):
-        unpack_window(window)
+    for wrong, message in ((np.zeros((3, 4)), "int32"), (window, "cannot hold 3")):
+        with pytest.raises(ValueError, match=message):
+            unpack_window(wrong)
 
 
-def test_the_picture_shows_the_last_polarity_of_each_pixel():
+def test_the_picture_shows_the_last_polarity_of_each_pixel_and_no_event_may_lie_outside():
     events = as_events([(1, 2, 0, 1), (2, 2, 0, -1), (3, 0, 1, -1), (4, 0, 1, 1)])
     assert event_image(events, 3, 2).tolist() == [[0, 0, 125], [255, 0, 0]]
     assert event_image(events, 3, 2).dtype == np.uint8
+    for x, y in ((3, 0), (0, 2)):
+        with pytest.raises(ValueError, match="event 0"):
+            event_image(as_events([(1, x, y, 1)]), 3, 2)
 
 
-@pytest.mark.parametrize(("x", "y"), [(3, 0), (0, 2)])
-def test_an_event_outside_the_picture_is_refused(x, y):
-    with pytest.raises(ValueError, match="event 0"):
-        event_image(as_events([(1, x, y, 1)]), 3, 2)
-
-
-@pytest.mark.parametrize("capacity", [3, 50, None])
+@pytest.mark.parametrize("capacity", [3, None])
 def test_windows_packed_together_are_those_packed_alone(capacity):
     rng, span_us, starts_us = np.random.default_rng(0), 1000, [0, 500, 7000, 9000]
     parts = []

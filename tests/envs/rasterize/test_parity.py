@@ -10,7 +10,6 @@ from envs.rasterize import PyrenderRenderer
 from envs.scene import BOX, CONE, ELLIPSOID, OBSTACLE, POLE, Scene, Texture, make_scene
 from envs.scene.obstacles import KINDS
 from envs.scene.textures import PATTERNS
-from envs.scene.triangles import to_trimesh
 from tests.support.point_samples import sample_luminance
 
 EMPTY = np.zeros(0, OBSTACLE)
@@ -73,23 +72,14 @@ def test_every_kind_of_body_is_the_same_picture_at_equal_sample_points(renderer,
     assert found.max() < 6e-4
 
 
-@pytest.mark.parametrize("name", ["poles", "poles_eval"])
-def test_both_renderers_agree_on_the_layouts(renderer, name):
-    scenes = [make_scene(name, np.random.default_rng(seed)) for seed in range(12)]
-    rng = np.random.default_rng(0)
-    found = [differences(renderer, scene, pose, 0.0).mean() for scene in scenes for pose in poses(rng, 5)]
-    assert np.mean(found) < 1e-4
-
-
-@pytest.mark.parametrize("velocity", [(0.0, 0.0), (1.3, -0.7)], ids=["still", "moving"])
 @pytest.mark.parametrize("pattern", PATTERNS[1:])
-def test_every_texture_is_the_same_picture_at_equal_sample_points(renderer, pattern, velocity):
+def test_every_texture_is_the_same_picture_at_equal_sample_points(renderer, pattern):
     looks = {
-        "ground_texture": Texture(pattern, 2.0, 0.5, velocity, 3),
-        "wall_texture": Texture(pattern, 1.5, 0.25, velocity[::-1], 1),
-        "obstacle_texture": Texture(pattern, 0.8, 0.5, velocity, 2),
+        "ground_texture": Texture(pattern, 2.0, 0.5, (1.3, -0.7), 3),
+        "wall_texture": Texture(pattern, 1.5, 0.25, (-0.7, 1.3), 1),
+        "obstacle_texture": Texture(pattern, 0.8, 0.5, (1.3, -0.7), 2),
     }
-    found = mean_differences(renderer, (POLE, CONE, ELLIPSOID, BOX), 6, **looks)
+    found = mean_differences(renderer, (POLE, CONE, ELLIPSOID, BOX), 3, **looks)
     assert found.mean() < 1.5e-4
     assert np.median(found) < 1e-4
     assert found.max() < 1e-3
@@ -98,10 +88,10 @@ def test_every_texture_is_the_same_picture_at_equal_sample_points(renderer, patt
 def test_surfaces_may_have_different_textures_or_none(renderer):
     looks = {
         "ground_texture": Texture("noise", 2.0, 0.5, (0.5, 0.0), 3),
-        "obstacle_texture": Texture("noise", 1.0, 0.5, (0.0, 2.0), 4),
+        "obstacle_texture": Texture("checker", 1.0, 0.5, (0.0, 2.0), 4),
     }
-    assert mean_differences(renderer, (POLE, BOX), 3, **looks).mean() < 1.5e-4
-    assert mean_differences(renderer, (POLE, BOX), 3).mean() < 1.5e-4
+    for some in (looks, {}):
+        assert mean_differences(renderer, (POLE, CONE, ELLIPSOID, BOX), 2, **some).mean() < 1.5e-4
 
 
 def test_textures_are_as_sharp_far_away_and_late(renderer):
@@ -116,30 +106,18 @@ def test_textures_are_as_sharp_far_away_and_late(renderer):
 def test_both_renderers_agree_from_places_that_no_flight_would_choose(renderer, kind):
     body = np.array([(kind, 1.0, 20.0, 3.0, 1.2, 1.2, 2.0, 0.4)], OBSTACLE)
     scene = Scene(name="test", obstacles=body)
-    places = {
-        "inside": (1.1, 20.1, 2.6, 0.3),
-        "at its axis": (1.0, 20.0, 2.0, 0.1),
-        "above": (1.2, 19.0, 9.0, 0.1),
-        "over its axis": (1.0, 20.0, 7.0, 0.4),
-        "below": (1.3, 17.5, 0.2, 0.1),
-        "level with its top": (1.3, 12.0, 5.0, 0.05),
-        "level with its bottom": (1.3, 12.0, 1.0, 0.05),
-        "on the ground": (0.2, 15.0, 0.0, 0.1),
-        "a millimetre over the ground": (0.2, 15.0, 1e-3, 0.1),
-        "close": (1.0, 18.7, 3.0, 0.2),
-        "a millimetre from it": (1.0, 18.799, 3.0, 0.2),
-        "high": (3.0, -40.0, 300.0, 0.1),
-        "far": (1e6, 1e6, 1e6, 0.3),
-        "behind a wall": (-25.0, 15.0, 9.0, -1.2),
-        "at the plane of a wall": (15.0, 5.0, 2.0, 0.3),
-    }
-    for name, pose in places.items():
-        found = differences(renderer, scene, pose, 0.0)
-        assert np.isfinite(found).all(), name
-        assert found.mean() < 1e-3, name
+    for pose in (
+        *[(1.1, 20.1, 2.6, 0.3), (1.0, 20.0, 2.0, 0.1)],  # inside and at its axis
+        *[(1.2, 19.0, 9.0, 0.1), (1.0, 20.0, 7.0, 0.4), (1.3, 17.5, 0.2, 0.1)],  # above, over its axis, below
+        *[(1.3, 12.0, 5.0, 0.05), (1.3, 12.0, 1.0, 0.05)],  # level with its top and its bottom
+        *[(0.2, 15.0, 0.0, 0.1), (0.2, 15.0, 1e-3, 0.1), (1.0, 18.799, 3.0, 0.2)],  # at the ground, at it
+        *[(3.0, -40.0, 300.0, 0.1), (1e6, 1e6, 1e6, 0.3)],  # high and far
+        *[(-25.0, 15.0, 9.0, -1.2), (15.0, 5.0, 2.0, 0.3)],  # behind a wall and in its plane
+    ):
+        assert differences(renderer, scene, pose, 0.0).mean() < 1e-3, pose
 
 
-@pytest.mark.parametrize("kind", [POLE, CONE, ELLIPSOID], ids=["pole", "cone", "ellipsoid"])
+@pytest.mark.parametrize("kind", [POLE, CONE, ELLIPSOID], ids=KINDS[:3])
 def test_corners_that_fall_together_far_away_move_no_edge(renderer, kind):
     found = []
     for away in np.geomspace(2.0, 200.0, 40):
@@ -149,25 +127,8 @@ def test_corners_that_fall_together_far_away_move_no_edge(renderer, kind):
     assert np.mean(found) < 4e-5
 
 
-def test_more_bodies_than_one_kind_hide_each_other(renderer):
-    assert mean_differences(renderer, (POLE, CONE, ELLIPSOID, BOX), 8).mean() < 1.3e-4
-
-
-def test_the_exported_mesh_drawn_as_a_mesh_is_the_same_picture(renderer):
-    rng = np.random.default_rng(5)
-    scene = Scene(name="test", obstacles=bodies((POLE, CONE, ELLIPSOID, BOX), rng))
-    mesh = to_trimesh(scene, sections=128).dump()[0]
-    part = (np.array(mesh.vertices), np.array(mesh.faces), np.array(mesh.vertex_attributes["luminance"]))
-    alone = Scene(name="mesh", obstacles=EMPTY, mesh=part, wall_height_m=1e-6)
-    for pose in poses(rng, 6):
-        renderer.set_scene(scene)
-        drawn = renderer.render(*pose)
-        renderer.set_scene(alone)
-        assert np.abs(renderer.render(*pose) - drawn).mean() < 3e-4
-
-
 # glTF is y-up: its (x, y, z) is (x, -z, y) in the lane.
-@pytest.mark.parametrize("suffix", [".glb", ".obj", ".stl", ".ply"])
+@pytest.mark.parametrize("suffix", [".glb", ".ply"])
 def test_a_mesh_file_is_drawn_as_the_bodies_it_holds(renderer, suffix, tmp_path):
     rows = [(BOX, 2.0, 20.0, 3.0, 1.0, 2.0, 1.5, 0.25), (ELLIPSOID, -4.0, 25.0, 4.0, 1.5, 1.5, 1.5, 0.25)]
     alike = Scene(name="test", obstacles=np.array(rows, OBSTACLE))
@@ -188,13 +149,13 @@ def test_a_mesh_file_is_drawn_as_the_bodies_it_holds(renderer, suffix, tmp_path)
         assert np.abs(renderer.render(*pose) - truth).mean() < 6e-4
 
 
-@pytest.mark.parametrize(("width", "height", "fov_deg"), [(96, 40, 60.0), (40, 96, 120.0), (33, 31, 20.0)])
+@pytest.mark.parametrize(("width", "height", "fov_deg"), [(96, 40, 60.0), (33, 31, 120.0)])
 def test_images_of_any_shape_and_lens_agree(renderer, width, height, fov_deg):
     rng = np.random.default_rng(2)
     looks = {"ground_texture": Texture("noise", 2.0, 0.5), "obstacle_texture": Texture("rings", 1.0, 0.5)}
     scene = Scene(name="test", obstacles=bodies((POLE, CONE, ELLIPSOID, BOX), rng), **looks)
     drawn = PyrenderRenderer(scene, width, height, fov_deg, samples=1)
-    for pose in poses(rng, 5):
+    for pose in poses(rng, 3):
         truth = sample_luminance(scene, pose, width, height, fov_deg)
         assert np.abs(drawn.render(*pose) - truth).mean() < 8e-4
     drawn.close()
@@ -204,14 +165,11 @@ def test_more_samples_come_closer_to_the_mean_over_the_pixel():
     rng = np.random.default_rng(3)
     looks = {"ground_texture": Texture("noise", 3.0, 0.5), "obstacle_texture": Texture("stripes", 1.0, 0.5)}
     scene = Scene(name="test", obstacles=bodies((POLE, CONE, ELLIPSOID, BOX), rng), **looks)
-    views = poses(rng, 4)
-    truth = [sample_luminance(scene, pose, 64, 64, samples=12) for pose in views]
-    errors = []
+    views, errors = poses(rng, 4), []
+    truth = np.stack([sample_luminance(scene, pose, 64, 64, samples=12) for pose in views])
     for samples in (1, 2, 4):
         drawn = PyrenderRenderer(scene, 64, 64, samples=samples)
-        errors.append(
-            np.mean([np.abs(drawn.render(*pose) - t).mean() for pose, t in zip(views, truth, strict=True)])
-        )
+        errors.append(np.abs([drawn.render(*pose) for pose in views] - truth).mean())
         drawn.close()
     assert errors[1] < 0.5 * errors[0]
     assert errors[2] < 0.6 * errors[1]
@@ -227,17 +185,15 @@ def distances(found: np.ndarray, eye: tuple[float, float, float]) -> np.ndarray:
 
 def test_culling_drops_the_far_bodies_and_nothing_else(renderer):
     culled = PyrenderRenderer(Scene(name="test", obstacles=EMPTY), 64, 64, samples=1, cull_m=30.0)
-    assert np.isfinite(culled.render(0, 0, 2)).all()
-    for seed in range(6):
+    for seed in range(3):
         rng = np.random.default_rng(seed)
         scene = Scene(name="test", obstacles=bodies((POLE, CONE, ELLIPSOID, BOX, BOX), rng))
         culled.set_scene(scene)
-        for pose in poses(rng, 8):
+        for pose in poses(rng, 5):
             away = distances(scene.obstacles, pose[:3])
             culled.cull_m = float(np.median(away)) * (1 + 1e-9)
             renderer.set_scene(dataclasses.replace(scene, obstacles=scene.obstacles[away <= culled.cull_m]))
             np.testing.assert_array_equal(culled.render(*pose), renderer.render(*pose))
     culled.close()
-    for bad in (0.0, -1.0, np.nan):
-        with pytest.raises(ValueError, match="cull_m must be > 0"):
-            PyrenderRenderer(scene, 8, 8, cull_m=bad)
+    with pytest.raises(ValueError, match="cull_m must be > 0"):
+        PyrenderRenderer(scene, 8, 8, cull_m=np.nan)

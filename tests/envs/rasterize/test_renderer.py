@@ -8,22 +8,8 @@ import pytest
 import trimesh
 
 from envs.rasterize import PyrenderRenderer
-from envs.rasterize.renderer import FRAME
-from envs.rasterize.shaders import SURFACES
-from envs.raycast import RaycastRenderer
 from envs.scene import OBSTACLE, Scene, Texture, make_scene
 from envs.scene.obstacles import KINDS
-from envs.scene.textures import PATTERNS
-
-POSES = [
-    (0, 0, 2, 0),
-    (5, 20, 2, 0.4),
-    (-8, 40, 3, -0.7),
-    (0, 50, 12, 0.2),
-    (30, 40, 9, 1.4),
-    (0, 95, 2, 3.1),
-    (12, 70, 0.5, -1.5),
-]
 
 
 @pytest.fixture(scope="module")
@@ -47,27 +33,7 @@ def make(scene):
         renderer.close()
 
 
-def test_anti_aliasing_comes_closer_to_the_exact_picture(make, scene):
-    exact = RaycastRenderer(scene, 64, 64)
-    centres, smooth = make(samples=1), make()
-    for pose in POSES[:4]:
-        truth = exact.render(*pose)
-        errors = [np.abs(renderer.render(*pose) - truth).mean() for renderer in (centres, smooth)]
-        assert errors[1] < 0.4 * errors[0]
-        assert errors[1] < 3e-3
-
-
-def test_the_image_is_linear_float_and_finer_than_eight_bits(make, scene):
-    image = make().render(0, 0, 2)
-    assert image.shape == (64, 64)
-    assert image.dtype == np.float32
-    assert image[0, 32] == np.float32(scene.sky_luminance)
-    assert image[-1, 32] == pytest.approx(float(scene.shade(scene.ground_albedo, (0, 0, 1))), abs=1e-6)
-    assert np.abs(image * 255 - np.rint(image * 255)).max() > 0.1
-
-
-@pytest.mark.parametrize("samples", [1, 2])
-def test_every_pixel_lies_between_the_darkest_and_the_brightest_surface(make, samples):
+def test_every_pixel_lies_between_the_darkest_and_the_brightest_surface(make):
     rng = np.random.default_rng(7)
     found = np.zeros(24, OBSTACLE)
     found["kind"] = np.arange(24) % len(KINDS)
@@ -75,17 +41,16 @@ def test_every_pixel_lies_between_the_darkest_and_the_brightest_surface(make, sa
     found["rx"] = found["ry"] = rng.uniform(0.05, 2.0, 24)
     found["rz"], found["albedo"] = rng.uniform(0.05, 3.0, 24), 0.4
     found["z"] = found["rz"] + rng.uniform(0.0, 3.0, 24) * (np.arange(24) % 3 > 0)
-    looks = {
-        key: Texture("noise", 1.0, 0.25) for key in ("ground_texture", "wall_texture", "obstacle_texture")
-    }
+    surfaces = ("ground_texture", "wall_texture", "obstacle_texture")
+    looks = dict.fromkeys(surfaces, Texture("noise", 1.0, 0.25))
     world = Scene(name="test", obstacles=found, **looks)
     darkest, brightest = 0.4 * 0.75 * world.ambient, 0.8 * 1.25
-    renderer = make(scene=world, samples=samples)
+    renderer = make(scene=world, samples=2)
     for _ in range(60):
         body = found[rng.integers(24)]
         at = [body[k] + rng.choice([0.0, 1e-6, 1e-3, 1.0, 3.0]) * rng.normal() for k in ("x", "y", "z")]
         image = renderer.render(at[0], at[1], abs(at[2]), rng.uniform(-10, 10), rng.uniform(-5, 5))
-        assert np.isfinite(image).all()
+        assert image.dtype == np.float32
         assert darkest - 1e-5 <= image.min() <= image.max() <= brightest + 1e-5
 
 
@@ -113,26 +78,6 @@ def test_pyrender_finds_the_name_that_numpy_2_removed(make):
 
     low, high = pyrender.Mesh.from_trimesh(trimesh.creation.box((1.0, 2.0, 3.0))).bounds
     assert (high - low).tolist() == [1.0, 2.0, 3.0]
-
-
-def test_the_uniforms_lie_in_memory_as_the_shaders_expect(make):
-    make()
-    from OpenGL import GL
-
-    from envs.rasterize.context import Program, start
-
-    platform, _ = start(8, 8, False)
-    with platform.current():
-        for surface in range(len(SURFACES)):
-            size, program = np.zeros(1, np.int32), Program(surface, PATTERNS.index("plain"))
-            GL.glGetActiveUniformBlockiv(program._program_id, 0, GL.GL_UNIFORM_BLOCK_DATA_SIZE, size)
-            assert size[0] == FRAME.itemsize
-    platform.delete_context()
-
-
-def test_rendering_twice_gives_the_same_bytes(make):
-    one, two = make(), make()
-    assert one.render(0, 30, 2).tobytes() == one.render(0, 30, 2).tobytes() == two.render(0, 30, 2).tobytes()
 
 
 @pytest.mark.parametrize("end", ["close", "collected"])
@@ -183,9 +128,13 @@ def test_threads_render_with_their_own_renderer_and_with_one_made_elsewhere(make
     assert np.array_equal(results["shared"], expected)
 
 
-def test_textured_and_plain_scenes_share_a_renderer_and_two_renderers_a_scene(make, scene):
-    plain, waves = Texture(), Texture("noise", 2.0, 0.5, (1.0, 0.0))
-    worlds = [dataclasses.replace(scene, ground_texture=look) for look in (plain, waves)]
+def test_scenes_follow_each_other_textured_or_not_in_renderers_side_by_side(make, scene):
+    waves = Texture("noise", 2.0, 0.5, (1.0, 0.0))
+    worlds = [
+        scene,
+        dataclasses.replace(scene, ground_texture=waves),
+        make_scene("poles", np.random.default_rng(4)),
+    ]
     fresh = [make(scene=world).render(0, 10, 2, 0, 0.3) for world in worlds]
     assert np.abs(fresh[0] - fresh[1]).mean() > 0.01
     one, two = make(), make()
@@ -196,25 +145,7 @@ def test_textured_and_plain_scenes_share_a_renderer_and_two_renderers_a_scene(ma
             for renderer in (one, two):
                 np.testing.assert_array_equal(renderer.render(0, 10, 2, 0, 0.3), expected)
     one.close()
-    np.testing.assert_array_equal(two.render(0, 10, 2, 0, 0.3), fresh[1])
-
-
-def test_a_renderer_after_many_others_works(scene, make):
-    expected = make().render(0, 10, 2)
-    for _ in range(12):
-        other = PyrenderRenderer(scene, 64, 64)
-        np.testing.assert_array_equal(other.render(0, 10, 2), expected)
-        other.close()
-
-
-def test_scenes_follow_each_other_and_none_is_left_behind(make):
-    worlds = [make_scene("poles", np.random.default_rng(seed)) for seed in range(3)]
-    renderer = make()
-    fresh = [make(scene=world).render(0, 10, 2) for world in worlds]
-    for _ in range(2):
-        for world, expected in zip(worlds, fresh, strict=True):
-            renderer.set_scene(world)
-            assert np.array_equal(renderer.render(0, 10, 2), expected)
+    np.testing.assert_array_equal(two.render(0, 10, 2, 0, 0.3), fresh[2])
 
 
 def test_a_failure_of_opengl_can_be_pickled(make, monkeypatch):
@@ -230,28 +161,3 @@ def _raise_gl_error(_platform: object) -> None:
     from OpenGL.error import GLError
 
     raise GLError(12290, "bad access", baseOperation=None)
-
-
-LOOKS = {
-    "plain": {},
-    "moving checkers": {
-        "ground_texture": Texture("checker", 2.0, 0.5, (1.0, 0.5)),
-        "wall_texture": Texture("checker", 1.5, 0.25, (0.5, 0.0)),
-        "obstacle_texture": Texture("checker", 0.5, 0.5, (1.0, 0.0)),
-    },
-    "moving noise": {
-        key: Texture("noise", 1.5, 0.25, (1.0, 0.5))
-        for key in ("ground_texture", "wall_texture", "obstacle_texture")
-    },
-}
-
-
-@pytest.mark.benchmark
-@pytest.mark.parametrize("look", LOOKS)
-@pytest.mark.parametrize("kind", range(len(KINDS)), ids=KINDS)
-@pytest.mark.parametrize("samples", [1, 2])
-def test_a_frame_of_forty_bodies_takes_milliseconds(benchmark, make, scene, kind, look, samples):
-    found = scene.obstacles.copy()
-    found["kind"] = kind
-    world = dataclasses.replace(scene, obstacles=found, **LOOKS[look])
-    benchmark(make(scene=world, samples=samples).render, 0.3, 20.0, 2.0, 0.05, 0.1)

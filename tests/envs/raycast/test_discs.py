@@ -9,8 +9,7 @@ from envs.config import EnvConfig, FidelityConfig
 from envs.event_error import error_between
 from envs.fidelity import choose_renderer
 from envs.raycast import RaycastRenderer
-from envs.raycast.columns import aim, paint_columns
-from envs.scene import ELLIPSOID, OBSTACLE, POLE, Scene, at_velocity
+from envs.scene import ELLIPSOID, OBSTACLE, POLE, Scene
 from tests.support.point_samples import sample_luminance
 
 NO_WALL = {"wall_height_m": 1e-6}
@@ -41,10 +40,8 @@ def some_poses(count=6):
 def test_with_more_samples_discs_become_what_strips_show():
     scene, poses = world(), some_poses()
     exact = pictures(scene, poses, samples=6)
-    errors = [
-        np.abs(pictures(scene, poses, samples=samples, discs=True) / exact - 1.0).mean()
-        for samples in (1, 2, 4)
-    ]
+    found = [pictures(scene, poses, samples=samples, discs=True) for samples in (1, 2, 4)]
+    errors = [np.abs(picture / exact - 1.0).mean() for picture in found]
     assert errors[0] < 0.01
     assert errors[1] < 0.4 * errors[0]
     assert errors[2] < 0.4 * errors[1]
@@ -61,22 +58,7 @@ def test_spheres_that_overlap_are_drawn_closer_to_the_truth_than_by_strips():
     assert by_discs < by_strips
 
 
-@pytest.mark.parametrize("samples", [1, 3])
-def test_a_column_drawn_alone_is_that_of_the_whole_image(samples):
-    renderer, rng = RaycastRenderer(world(), 64, 64, samples=samples, discs=True), np.random.default_rng(2)
-    for pose in some_poses():
-        whole = renderer.render(*pose)
-        part = np.full((64, 64), -1.0, np.float32).T
-        first, last = np.sort(rng.choice(65, 2, replace=False))
-        renderer.room.frames[0] = renderer.frame[0]
-        aim(renderer.room.frames[0], *pose)
-        paint_columns(renderer.bodies, renderer.noise, part, first, last, renderer.cull_m, renderer.room)
-        assert part[:, first:last].tobytes() == whole[:, first:last].tobytes()
-        assert (np.delete(part, np.s_[first:last], axis=1) == -1.0).all()
-        assert not renderer.room.accumulators.any()
-
-
-@pytest.mark.parametrize("radius", [0.02, 0.15, 0.3, 0.6])
+@pytest.mark.parametrize("radius", [0.02, 0.3, 0.6])
 def test_a_small_sphere_hides_its_area_wherever_it_lies_in_a_pixel(radius):
     hidden = []
     for x in np.linspace(0.0, 0.3, 7):
@@ -88,40 +70,16 @@ def test_a_small_sphere_hides_its_area_wherever_it_lies_in_a_pixel(radius):
     assert np.ptp(hidden) < 0.05 * area + 0.01
 
 
-def test_spheres_that_move_are_drawn_where_they_are():
-    scene = world(40)
-    moving = tuple(at_velocity(body, (1.0, -2.0, 0.5)) for body in scene.obstacles)
-    moved = scene.obstacles.copy()
-    for axis, way in zip("xyz", (0.5, -1.0, 0.25), strict=True):
-        moved[axis] += way
-    still = dataclasses.replace(scene, obstacles=moved)
-    scene = dataclasses.replace(scene, obstacles=scene.obstacles[:0], moving=moving)
-    pose = (0.0, -5.0, 4.0, 0.0)
-    there = RaycastRenderer(scene, 64, 64, discs=True).render(*pose, 0.5)
-    assert np.abs(there - RaycastRenderer(still, 64, 64, discs=True).render(*pose, 0.5)).max() < 1e-5
-
-
 def test_events_come_to_those_of_the_ray_caster(tmp_path):
     rows = world().obstacles
     lines = [f"s, {q['y']}, {-q['x']}, {q['z']}, 1, 0, 0, 0" + f", {2.0 * q['rx']}" * 3 for q in rows]
     (tmp_path / "world.csv").write_text("\n".join(lines) + "\n")
+    vehicle = {"speed_mps": 10.0, "control_hz": 100.0, "vehicle_radius_m": 0.0}
     layout = {"passable": False, "wall_height_m": 1e-6}
-    config = EnvConfig(
-        scene=str(tmp_path / "world.csv"),
-        layout=layout,
-        speed_mps=10.0,
-        control_hz=100.0,
-        vehicle_radius_m=0.0,
-    )
-    errors = [
-        error_between(
-            config,
-            dataclasses.replace(config, renderer="spheres", fidelity=FidelityConfig(samples=samples)),
-            flights=2,
-            steps=3,
-        )
-        for samples in (1, 4)
-    ]
+    config, errors = EnvConfig(scene=str(tmp_path / "world.csv"), layout=layout, **vehicle), []
+    for samples in (1, 4):
+        other = dataclasses.replace(config, renderer="spheres", fidelity=FidelityConfig(samples=samples))
+        errors.append(error_between(config, other, flights=2, steps=3))
     assert errors[0] < 0.35
     assert errors[1] < 0.3 * errors[0]
 

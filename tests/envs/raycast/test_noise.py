@@ -10,10 +10,10 @@ from envs.scene import Texture, make_scene
 from envs.scene.textures import noise_waves
 
 
-@pytest.mark.parametrize("size", [0.0, 1e-5, 0.1, 1.0, 30.0])
+@pytest.mark.parametrize("size", [0.0, 0.1, 30.0])
 def test_the_mean_over_a_parallelogram_is_the_sum_of_the_means_of_its_waves(size):
     rng, (cycles, amplitudes) = np.random.default_rng(1), noise_waves(4)
-    for _ in range(50):
+    for _ in range(20):
         s, q = rng.uniform(-1e4, 1e4, 2)
         sides = size * rng.uniform(-1.0, 1.0, (2, 2))
         found = mean_noise(waves_of(4), np.zeros(WAVES, np.float32), s, q, Footprint(*sides.ravel().tolist()))
@@ -28,10 +28,9 @@ def test_sides_of_any_length_leave_a_finite_mean():
         assert abs(mean) <= 1.0
 
 
-@pytest.mark.parametrize("period_m", [0.3, 1.0, 4.0])
-@pytest.mark.parametrize("size", [(64, 64), (31, 33)])
-def test_the_tabulated_ground_shows_the_mean_of_a_much_finer_image(period_m, size):
-    (width, height), fine = size, 8
+@pytest.mark.parametrize(("period_m", "width", "height"), [(0.3, 64, 64), (1.0, 31, 33), (4.0, 64, 64)])
+def test_the_tabulated_ground_shows_the_mean_of_a_much_finer_image(period_m, width, height):
+    fine = 8
     scene = make_scene("poles", np.random.default_rng(0))
     texture = Texture("noise", period_m, 0.9, (3.0, -1.0), seed=2)
     scene = dataclasses.replace(scene, ground_texture=texture, obstacles=scene.obstacles[:0])
@@ -48,7 +47,7 @@ def test_the_tabulated_ground_shows_the_mean_of_a_much_finer_image(period_m, siz
         assert np.array_equal(known.render(*other), alone.render(*other))
 
 
-@pytest.mark.parametrize("period_m", [0.5, 3.0, 30.0])
+@pytest.mark.parametrize("period_m", [0.5, 30.0])
 def test_pixels_that_thin_poles_cut_show_the_mean_of_a_finer_image_too(period_m):
     scene, fine = make_scene("poles", np.random.default_rng(0), radius_min_m=0.05, radius_max_m=0.05), 8
     scene = dataclasses.replace(scene, ground_texture=Texture("noise", period_m, 0.9, seed=2))
@@ -71,7 +70,3 @@ def test_the_type_of_a_height_compiles_nothing_again():
     renderer = RaycastRenderer(make_scene("texture_change", np.random.default_rng(0)), 16, 16)
     renderer.expect_height(2)
     assert isinstance(renderer.noise.height, float)
-
-
-def test_waves_come_by_fours():
-    assert WAVES % 4 == 0

@@ -50,24 +50,14 @@ def errors(scene: Scene, t_s: float = 0.0) -> list[float]:
 def test_each_pattern_on_each_surface_looks_as_many_point_samples_of_it(surface, name):
     t_s = 1.3  # later than 0: the pattern has moved
     scene = world(**{surface: name}, t=t_s)
-    plain = dataclasses.replace(
-        scene, ground_texture=Texture(), wall_texture=Texture(), obstacle_texture=Texture()
-    )
-    images = [RaycastRenderer(one, 24, 24).render(*POSES[1], t_s) for one in (scene, plain)]
+    images = [RaycastRenderer(one, 24, 24).render(*POSES[1], t_s) for one in (scene, world())]
     assert np.abs(images[0] - images[1]).mean() > 1e-3  # there is something to see
     one, four = errors(scene, t_s)
     assert one < BOUNDS[surface][0]
     assert four < BOUNDS[surface][1]
 
 
-def test_more_samples_come_closer_to_a_checkered_world():
-    scene = world(ground="checker", walls="checker", obstacles="checker")
-    one, four = errors(scene)
-    assert four < one < 0.0015
-
-
-@pytest.mark.parametrize("radius", [0.5, 0.8, 1.2])
-@pytest.mark.parametrize("x", [-4.5, -1.0, 0.0, 2.25])
+@pytest.mark.parametrize(("x", "radius"), [(-4.5, 0.5), (0.0, 0.8), (2.25, 1.2)])
 def test_a_pole_straight_ahead_is_as_one_a_hair_beside_it(radius, x):
     # An edge of the pattern is then exactly where a strip begins.
     pole = bodies()[:1]
@@ -102,60 +92,18 @@ def test_a_wall_seen_at_right_angles_is_averaged_exactly():
     np.testing.assert_allclose(image[row], part * upper + (1.0 - part) * scene.sky_luminance, atol=2e-5)
 
 
-@pytest.mark.parametrize("name", PATTERNS)
-def test_a_ground_that_moves_is_a_camera_that_moves_back(name):
-    moving = Texture(name, 3.0, 0.4, (1.5, -2.0), 1)
-    scene = Scene("hand", bodies()[:0], wall_height_m=1e-9, width_m=1e5, ground_texture=moving)
-    renderer = RaycastRenderer(scene, 32, 32)
-    np.testing.assert_allclose(
-        renderer.render(4.0, 10.0, 2.0, 0.3, 2.0), renderer.render(1.0, 14.0, 2.0, 0.3, 0.0), atol=1e-6
-    )
-    assert (
-        np.abs(renderer.render(4.0, 10.0, 2.0, 0.3, 0.3) - renderer.render(4.0, 10.0, 2.0, 0.3)).max() > 0.02
-    )
+SURFACES = ("ground_texture", "wall_texture", "obstacle_texture")
 
 
-def test_after_a_whole_period_a_moving_world_looks_the_same():
-    scene = world(ground="checker", walls="stripes", obstacles="rings")
-    speeds = {"ground_texture": (3.0, 6.0), "wall_texture": (-2.0, 0.0), "obstacle_texture": (0.0, 0.9)}
-    moving = {key: dataclasses.replace(getattr(scene, key), velocity_mps=v) for key, v in speeds.items()}
-    renderer = RaycastRenderer(dataclasses.replace(scene, **moving), 32, 32)
-    still = RaycastRenderer(scene, 32, 32)
-    for pose in POSES:
-        np.testing.assert_allclose(renderer.render(*pose, 7.0), still.render(*pose), atol=2e-5)
-        assert np.abs(renderer.render(*pose, 7.3) - still.render(*pose)).max() > 0.01
-
-
-def test_without_contrast_a_texture_changes_no_byte():
-    faint = {
-        key: Texture("noise", 1.0, 0.0) for key in ("ground_texture", "wall_texture", "obstacle_texture")
-    }
+def test_without_contrast_a_texture_changes_no_byte_and_much_finer_than_a_pixel_it_is_its_mean():
     scene = world()
+    without = dict.fromkeys(SURFACES, Texture("noise", 1.0, 0.0))
+    fine = [dict.fromkeys(SURFACES, Texture(name, 1e-3, 0.2)) for name in PATTERNS]
     for pose in POSES:
-        plain = RaycastRenderer(scene, 32, 32).render(*pose)
-        assert np.array_equal(
-            RaycastRenderer(dataclasses.replace(scene, **faint), 32, 32).render(*pose), plain
+        plain, same, *textured = (
+            RaycastRenderer(dataclasses.replace(scene, **looks), 24, 24).render(*pose)
+            for looks in ({}, without, *fine)
         )
-
-
-@pytest.mark.parametrize("name", PATTERNS)
-def test_a_pattern_much_finer_than_a_pixel_is_its_mean(name):
-    fine = {key: Texture(name, 1e-3, 0.2) for key in ("ground_texture", "wall_texture", "obstacle_texture")}
-    scene = world()
-    for pose in POSES:
-        plain = RaycastRenderer(scene, 24, 24).render(*pose)
-        textured = RaycastRenderer(dataclasses.replace(scene, **fine), 24, 24).render(*pose)
-        assert np.abs(textured - plain).max() < 0.01
-
-
-def test_all_that_is_textured_stays_within_the_contrast():
-    scene = world(ground="checker", walls="noise", obstacles="rings")
-    plain = world()
-    black = {"ground_albedo": 0.0, "wall_albedo": 0.0, "sky_luminance": 0.0}
-    for pose in POSES:
-        full = RaycastRenderer(scene, 32, 32).render(*pose)
-        bare = RaycastRenderer(plain, 32, 32).render(*pose)
-        assert (full <= 1.4 * bare + 1e-6).all()
-        assert (full >= 0.6 * bare - 1e-6).all()
-        dark = RaycastRenderer(dataclasses.replace(scene, **black), 32, 32).render(*pose)
-        assert dark.min() >= -1e-9
+        assert np.array_equal(same, plain)
+        for image in textured:
+            assert np.abs(image - plain).max() < 0.01

@@ -10,10 +10,9 @@ import numpy as np
 import pyarrow
 import pytest
 
-from envs.events import EVENT
 from envs.recordings import read_events, write_events
 from envs.recordings.event_file import CUT_PACKETS
-from tests.support.event_files import LZ4_FILE, ZSTD_FILE, aedat2, some_events
+from tests.support.event_files import LZ4_FILE, ZSTD_FILE, aedat2, aedat3, some_events
 
 DATA = Path(os.environ.get("EVADE_DATA", Path(__file__).resolve().parents[4] / "shared" / "data"))
 CHECKERBOARDS = DATA / "dvs128_checkerboard"
@@ -48,15 +47,12 @@ def packet(events: list[tuple[int, int, int, int]], count: int | None = None) ->
 
 
 @needs_samples
-@pytest.mark.parametrize(
-    ("name", "count", "span_us"), [("checkerboard_3", 49_724, 111_580), ("calibration_23", 76_732, 568_582)]
-)
-def test_the_checkerboards_decode_as_by_their_description(name, count, span_us):
-    path = CHECKERBOARDS / f"{name}.aedat"
+def test_a_checkerboard_decodes_as_by_the_description():
+    path = CHECKERBOARDS / "checkerboard_3.aedat"
     file = read_events(path)
     assert (file.format, file.width, file.height, file.late) == ("aedat2", 128, 128, 0)
-    assert len(file.events) == count
-    assert file.events["t"][-1] - file.events["t"][0] == span_us
+    assert len(file.events) == 49_724
+    assert file.events["t"][-1] - file.events["t"][0] == 111_580
     with path.open("rb") as raw:
         while (line := raw.readline()).startswith(b"#"):
             pass
@@ -79,8 +75,9 @@ def test_a_davis_is_read_with_the_addresses_that_simulators_write_for_it(tmp_pat
     assert sorted(file.events.tolist()) == sorted((100 + x, x, y, p) for x, y, p in pixels)
     unnamed = aedat2(tmp_path / "b.aedat", entries)
     assert read_events(unnamed, width=346, height=260).events.tobytes() == file.events.tobytes()
-    with pytest.raises(ValueError, match="an unknown camera"):
-        read_events(unnamed)
+    outside = aedat2(tmp_path / "c.aedat", [(300 << 12, 1)], "x.DAVIS240C")
+    with pytest.raises(ValueError, match="1 of 1 outside the sensor of 240x180"):
+        read_events(outside)
 
 
 def test_special_events_of_a_dvs128_are_passed_over_and_its_clock_unwrapped(tmp_path):
@@ -96,31 +93,24 @@ def test_jaers_end_of_header_lets_the_first_address_begin_like_a_comment(tmp_pat
     assert read_events(tmp_path / "a.aedat").events["t"].tolist() == [7]
 
 
-@pytest.mark.parametrize(
-    ("entries", "chip", "rule"),
-    [
-        ([(0, 1)], "ch.unizh.ini.DVS640", "DVS640, no DVS128 or DAVIS"),
-        ([(1 << 16, 1)], "", "an unknown camera"),
-        ([(300 << 12, 1)], "x.DAVIS240C", "1 of 1 outside the sensor of 240x180"),
-    ],
-)
-def test_an_aedat2_file_that_breaks_a_rule_is_refused(entries, chip, rule, tmp_path):
-    with pytest.raises(ValueError, match=rule):
-        read_events(aedat2(tmp_path / "a.aedat", entries, chip))
+def test_aedat3_has_events_triggers_and_a_clock_that_turns(tmp_path):
+    def polarity(t, x, y, on):
+        return struct.pack("<Ii", x << 17 | y << 2 | on << 1 | 1, t)
 
-
-@pytest.mark.parametrize(
-    ("content", "rule"),
-    [
-        (b"#!AER-DAT2.0", "header without end"),
-        (b"#!AER-DAT3.1\r\n", "header without its end"),
-        (b"#!AER-DAT1.0\r\n", "begins like no known"),
-    ],
-)
-def test_an_aedat2_file_that_is_cut_or_of_another_version_is_refused(content, rule, tmp_path):
-    (tmp_path / "a.aedat").write_bytes(content)
-    with pytest.raises(ValueError, match=rule):
-        read_events(tmp_path / "a.aedat")
+    invalid = struct.pack("<Ii", 5 << 17, 11)
+    triggers = struct.pack("<Ii", 2 << 1 | 1, 22) + struct.pack("<Ii", 3 << 1 | 1, 24)
+    packets = [
+        (1, 0, 8, polarity(10, 1, 4, 1) + invalid + polarity(20, 2, 5, 0)),
+        (0, 0, 8, triggers),
+        (1, 1, 8, polarity(35, 3, 6, 1)),
+    ]
+    path = aedat3(tmp_path / "a.aedat", packets)
+    file = read_events(path)
+    assert (file.format, file.width, file.height, file.skipped) == ("aedat3", 128, 128, 2)
+    assert file.events.tolist() == [(10, 1, 4, 1), (20, 2, 5, -1), (2**31 + 35, 3, 6, 1)]
+    assert file.triggers.tolist() == [(22, 0, 1), (24, 0, -1)]
+    path.write_bytes(path.read_bytes()[:-3])
+    assert read_events(path, stream=1).events.tolist() == [(10, 1, 4, 1), (20, 2, 5, -1)]
 
 
 @pytest.mark.parametrize("text", [LZ4_FILE, ZSTD_FILE], ids=["lz4", "zstd"])
@@ -147,14 +137,12 @@ def test_packets_of_other_streams_are_passed_over_whatever_they_hold(tmp_path):
         ([(0, packet([(5, 1, 2, 1)], count=2))], 0, None, "declares 2 entries and has no room"),
         ([(0, packet([(5, 1, 2, 1)])[:20])], 0, None, "damaged"),
         ([(0, packet([(5, 8, 2, 1)]))], 0, None, "1 of 1 outside the sensor of 8x6"),
-        ([(0, packet([(5, -1, 2, 1)]))], 0, None, "x must lie in"),
         ([(0, packet([(-5, 1, 2, 1)]))], 0, None, "t must lie in"),
         ([(0, b"no lz4 frame")], 1, None, "damaged"),
         ([(0, bytes(64))], 0, None, "where a packet of EVTS should be is one of"),
         ([(0, packet([]).replace(b"EVTS", b"FRME"))], 0, None, "should be is one of b'FRME'"),
         ([], 0, xml(0), "has no stream  of kind EVTS; its streams are none"),
         ([], 0, b"<!DOCTYPE x [<!ENTITY a 'b'>]><dv>&a;</dv>", "XML entities"),
-        ([], 0, b"<dv>", "damaged"),
         ([], 0, xml().replace(b">8<", b">wide<"), "damaged"),
     ],
 )
@@ -174,19 +162,17 @@ def test_a_packet_longer_than_the_file_is_counted_and_a_header_refused(tmp_path)
         read_events(path)
 
 
-@pytest.mark.parametrize(("codec", "name"), [(1, "lz4"), (3, "zstd")])
-def test_a_packet_that_unpacks_to_gigabytes_takes_no_memory(codec, name, tmp_path):
+def test_a_packet_that_unpacks_to_gigabytes_takes_no_memory(tmp_path):
     def packed(size: int) -> bytes:
         sink = pyarrow.BufferOutputStream()
-        with pyarrow.CompressedOutputStream(sink, name) as out:
+        with pyarrow.CompressedOutputStream(sink, "zstd") as out:
             out.write(struct.pack("<I", size) + b"\0\0\0\0EVTS")
             for _ in range(256):
                 out.write(bytes(1 << 20))
         return sink.getvalue().to_pybytes()
 
-    small = aedat4(tmp_path / "a.aedat4", [(0, packed(100))], codec)
-    large = aedat4(tmp_path / "b.aedat4", [(0, packed(1 << 30))], codec)
-    assert large.stat().st_size < 4 << 20
+    small = aedat4(tmp_path / "a.aedat4", [(0, packed(100))], 3)
+    large = aedat4(tmp_path / "b.aedat4", [(0, packed(1 << 30))], 3)
     before_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     assert read_events(small).events.tolist() == []  # a table without fields
     with pytest.raises(ValueError, match="at most 268435456 are unpacked"):
@@ -195,7 +181,7 @@ def test_a_packet_that_unpacks_to_gigabytes_takes_no_memory(codec, name, tmp_pat
 
 
 def test_packets_that_hold_one_event_and_megabytes_of_nothing_are_let_go(tmp_path):
-    size, number = 16 << 20, 12
+    size, number = 16 << 20, 5
     one = packet([(5, 1, 2, 1)])
     sink = pyarrow.BufferOutputStream()
     with pyarrow.CompressedOutputStream(sink, "zstd") as out:
@@ -222,54 +208,30 @@ def test_a_table_of_packets_that_is_not_where_the_header_says_is_refused(tmp_pat
             read_events(tmp_path / "a.aedat4")
 
 
-def dated_events(count: int) -> np.ndarray:
-    events = some_events(count, count, 346, 260, 10 * count + 1)
+@pytest.mark.parametrize("count", [0, 1 << 14, 40_000])
+def test_another_reader_gives_the_events_that_were_written(count, tmp_path):
+    aedat = pytest.importorskip("aedat", reason="the package aedat reads AEDAT 4.0 independently")
+    path, events = tmp_path / "a.aedat4", some_events(count, count, 346, 260, 10 * count + 1)
     events["t"] += 1_700_000_000_000_000
-    return events
+    write_events(path, events, 346, 260)
+    parts = [part["events"] for part in aedat.Decoder(path) if "events" in part]
+    assert sum(map(len, parts)) == count
+    for name in "txyp" if count else "":
+        theirs = np.concatenate([part["on" if name == "p" else name] for part in parts])
+        assert np.array_equal(theirs, events[name] > 0 if name == "p" else events[name])
+    assert read_events(path).events.tobytes() == events.tobytes()
 
 
-@pytest.mark.parametrize("count", [0, 1, 5, (1 << 14) - 1, 1 << 14, 40_000])
-def test_what_is_written_is_read(count, tmp_path):
-    events = dated_events(count)
-    write_events(tmp_path / "a.aedat4", events, 346, 260)
-    back = read_events(tmp_path / "a.aedat4")
-    assert back.events.tobytes() == events.tobytes()
-    assert (back.format, back.width, back.height) == ("aedat4", 346, 260)
-
-
-def test_a_sensor_that_signed_16_bits_cannot_address_is_refused(tmp_path):
-    with pytest.raises(ValueError, match="at most 32768 pixels"):
-        write_events(tmp_path / "a.aedat4", dated_events(1), 32769, 260)
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("count", [0, 1, 40_000])
+@pytest.mark.parametrize("count", [0, 40_000])
 def test_the_makers_library_reads_what_is_written(count, tmp_path):
     dv = pytest.importorskip("dv_processing", reason="the package dv-processing is the maker's reader")
-    events = dated_events(count)
+    events = some_events(count, count, 346, 260, 10 * count + 1)
     write_events(tmp_path / "a.aedat4", events, 346, 260)
     reader = dv.io.MonoCameraRecording(str(tmp_path / "a.aedat4"))
     assert tuple(reader.getEventResolution()) == (346, 260)
     parts = []
     while (part := reader.getNextEventBatch()) is not None:
         parts.append(part.numpy())
-    assert sum(map(len, parts)) == count
     for name, theirs in (("t", "timestamp"), ("x", "x"), ("y", "y"), ("p", "polarity")):
         found = np.concatenate([np.empty(0), *(part[theirs] for part in parts)])
         assert np.array_equal(found, events[name] > 0 if name == "p" else events[name])
-
-
-@pytest.mark.parametrize("written_here", [False, True])
-def test_another_reader_gives_the_same_events(written_here, tmp_path):
-    aedat = pytest.importorskip("aedat", reason="the package aedat reads AEDAT 4.0 independently")
-    path = tmp_path / "a.aedat4"
-    if written_here:
-        write_events(path, dated_events(40_000), 346, 260)
-    else:
-        path.write_bytes(zlib.decompress(base64.b85decode(LZ4_FILE)))
-    theirs = np.concatenate([part["events"] for part in aedat.Decoder(path) if "events" in part])
-    ours = read_events(path).events
-    assert ours.dtype == EVENT
-    for name in "txy":
-        assert np.array_equal(ours[name], theirs[name])
-    assert np.array_equal(ours["p"] > 0, theirs["on"])

@@ -14,7 +14,7 @@ import h5py
 import numpy as np
 import pytest
 
-from envs.recordings import FORMATS, WRITERS, read_events, write_events
+from envs.recordings import FORMATS, read_events, write_events
 from tests.support.bags import davis, write_bag
 from tests.support.event_files import (
     LZ4_FILE,
@@ -33,14 +33,9 @@ ROOT = Path(__file__).resolve().parents[3]
 
 def run_child(paths: list[Path], rounds: int = 0, seed: int = 0) -> dict[str, dict[str, int]]:
     """How many reads of each file, or of damaged copies of it, were "read" and "refused"."""
+    script = ROOT / "tests" / "support" / "damaged_files.py"
     child = subprocess.run(
-        [
-            sys.executable,
-            str(ROOT / "tests" / "support" / "damaged_files.py"),
-            str(rounds),
-            str(seed),
-            *map(str, paths),
-        ],
+        [sys.executable, str(script), str(rounds), str(seed), *map(str, paths)],
         cwd=ROOT,
         env=os.environ | {"PYTHONPATH": str(ROOT)},  # by its path: other packages are called tests too
         capture_output=True,
@@ -84,17 +79,13 @@ def one_of_each(folder: Path) -> list[Path]:
     return paths
 
 
-def test_there_is_a_good_file_of_every_format(tmp_path):
+def test_damaged_files_of_every_format_are_read_or_refused_by_name(tmp_path):
     paths = one_of_each(tmp_path)
     assert {read_events(path).format for path in paths} == set(FORMATS)
-
-
-def test_damaged_files_are_read_or_refused_by_name(tmp_path):
-    paths = one_of_each(tmp_path)
-    counts = run_child(paths, rounds=50)
+    counts = run_child(paths, rounds=30)
     for path in paths:
-        assert sum(counts[path.name].values()) == 50
-        assert counts[path.name]["refused"] > 10, path.name
+        assert sum(counts[path.name].values()) == 30
+        assert counts[path.name]["refused"] > 6, path.name
 
 
 @pytest.mark.slow
@@ -107,83 +98,14 @@ def test_a_million_damaged_files_are_read_or_refused_by_name(part, tmp_path):
     assert sum(map(sum, (count.values() for count in counts.values()))) > 1_000_000 // 16
 
 
-@pytest.mark.parametrize("name", ["geometry", "width", "about"])
-@pytest.mark.parametrize("kind", ["array", "truth", "list"])
-def test_an_attribute_that_is_no_single_number_or_text_is_refused_unread(kind, name, tmp_path):
-    path = tmp_path / "a.h5"
-    write_events(path, EVENTS, 34, 34)
-    with h5py.File(path, "a") as file:
-        if name != "width":
-            del file.attrs["width"]
-        if kind == "list":  # of numbers, whose length is declared beside them
-            data = np.empty((), object)
-            data[()] = np.arange(3, dtype="u1")
-            file.attrs.create(name, data, dtype=h5py.vlen_dtype("u1"))
-        else:
-            file.attrs[name] = {"array": np.arange(3), "truth": True}[kind]
-    with pytest.raises(ValueError, match=f"the attribute {name} is no single number or text"):
-        read_events(path)
-
-
-@pytest.mark.parametrize("size", [1, 3])
-def test_a_chunk_that_is_shorter_than_its_checksum_is_refused_unread(size, tmp_path):
-    path = tmp_path / "a.h5"
-    write_events(path, EVENTS, 34, 34)
-    with h5py.File(path, "a") as file:
-        file["events/x"].id.write_direct_chunk((0,), bytes(size))
-    with pytest.raises(ValueError, match="events/x has a chunk without its checksum"):
-        read_events(path)
-
-
-def test_a_checksum_within_a_compression_is_refused_with_the_remedy(tmp_path):
-    path = tmp_path / "a.h5"
-    write_events(path, EVENTS, 34, 34)
-    with h5py.File(path, "a") as file:
-        values = file["events/x"][:]
-        del file["events/x"]
-        packing = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-        packing.set_chunk(values.shape)
-        packing.set_fletcher32()
-        packing.set_deflate(4)
-        kind, space = h5py.h5t.py_create(values.dtype), h5py.h5s.create_simple(values.shape)
-        h5py.h5d.create(file["events"].id, b"x", kind, space, packing)
-        file["events/x"][:] = values
-    with pytest.raises(ValueError, match="events/x has its checksum within its compression; write it again"):
-        read_events(path)
-
-
-@pytest.mark.parametrize(
-    "attributes",
-    [{"width": 34.0, "height": 34.0}, {"geometry": "34x34"}, {"geometry": np.bytes_("34x34")},
-     {"width": 34, "height": 34, "geometry": [1, 2]}],
-)  # fmt: skip
-def test_a_size_is_read_as_other_programs_write_it(attributes, tmp_path):
-    path = tmp_path / "a.h5"
-    write_events(path, EVENTS, 34, 34)
-    with h5py.File(path, "a") as file:
-        for name in ("width", "height"):
-            del file.attrs[name]
-        for name, value in attributes.items():
-            file.attrs[name] = value
-    found = read_events(path)
-    assert (found.width, found.height) == (34, 34)
-
-
 @pytest.mark.system
 def test_bombs_and_liars_are_refused_in_little_memory(tmp_path):
-    bomb = tmp_path / "bomb.npz"
-    header = {"descr": "<i8", "fortran_order": False, "shape": (2,)}
-    with zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name in "txyp":
-            with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
-                np.lib.format.write_array_header_1_0(file, header)
-                for _ in range(256 if name == "t" else 0):
-                    file.write(bytes(1 << 20))
     shape = tmp_path / "shape.npz"
     with zipfile.ZipFile(shape, "w") as archive:
         for name in "txyp":
             with archive.open(f"{name}.npy", "w") as file:
-                np.lib.format.write_array_header_1_0(file, {**header, "shape": (1 << 50,)})
+                header = {"descr": "<i8", "fortran_order": False, "shape": (1 << 50,)}
+                np.lib.format.write_array_header_1_0(file, header)
     declared = tmp_path / "declared.h5"
     with h5py.File(declared, "w") as file:
         for name in "txyp":
@@ -199,16 +121,16 @@ def test_bombs_and_liars_are_refused_in_little_memory(tmp_path):
         out.write(b"% evt 3.0\n" + np.array([0x8000, 0x0001, 0x3000], "<u2").tobytes())
         for _ in range(100):
             out.write(np.full(1 << 20, 0x4FFF, "<u2").tobytes())
-    names = [bomb, shape, declared, sparse, line, vectors]
+    names = [shape, declared, sparse, line, vectors]
     assert all(path.stat().st_blocks * 512 < 1 << 28 for path in names)
     assert run_child(names) == {path.name: {"read": 0, "refused": 1} for path in names}
     for path in names:
         path.unlink()
 
 
-@pytest.mark.parametrize("format", ["es", "floats", *WRITERS])
+@pytest.mark.parametrize("format", ["es", "floats", "npz", "hdf5", "txt", "evt3", "aedat4"])
 def test_reading_takes_no_more_memory_than_stated(format, tmp_path):
-    events, path = np.tile(EVENTS, 200), tmp_path / f"a.{format}"
+    events, path = np.tile(EVENTS, 100), tmp_path / f"a.{format}"
     events["t"] = np.arange(len(events)) ^ 1  # half of them late
     ordered = events[np.argsort(events["t"])]
     if format == "es":
@@ -219,25 +141,19 @@ def test_reading_takes_no_more_memory_than_stated(format, tmp_path):
         path = tmp_path / "a.npz"
     else:
         write_events(path, ordered, 34, 34, format)
-    if format == "dat":
-        head, body = path.read_bytes()[: -8 * len(events)], path.read_bytes()[-8 * len(events) :]
-        path.write_bytes(head + np.frombuffer(body, "<u8").reshape(-1, 2)[:, ::-1].tobytes())
-    arguments = {
-        "format": "txt" if format == "csv" else None,
-        "time_unit": "us" if format == "floats" else None,
-    }
-    read_events(path, **arguments)  # imports what it needs
+    unit = "us" if format == "floats" else None
+    read_events(path, time_unit=unit)  # imports what it needs
     tracemalloc.start()
     try:
-        assert len(read_events(path, **arguments).events) == len(events)
+        assert len(read_events(path, time_unit=unit).events) == len(events)
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
-    each = 50 if format in ("es", "dat", "evt2", "evt3") else 80
+    each = 50 if format in ("es", "evt3") else 80
     assert peak < each * len(events) + (1 << 20)
 
 
-@pytest.mark.parametrize("format", [None, *FORMATS])
+@pytest.mark.parametrize("format", [None, "npz"])
 def test_what_is_no_regular_file_is_refused_without_being_opened(format, tmp_path):
     os.mkfifo(tmp_path / "fifo.npz")
     (tmp_path / "empty.raw").touch()
@@ -257,26 +173,12 @@ def test_what_is_no_regular_file_is_refused_without_being_opened(format, tmp_pat
             read_events(path, format)
 
 
-@pytest.mark.parametrize("format", [None, *FORMATS])
-def test_random_bytes_are_refused_in_every_format_that_can_tell(format, tmp_path):
-    path = tmp_path / "random.xyz"
-    path.write_bytes(np.random.default_rng(0).bytes(5 * 8 * 1000 + 3))
-    with pytest.raises(ValueError, match=r"random\.xyz"):
-        read_events(path, format)
-
-
-def test_a_file_larger_than_allowed_is_not_opened(tmp_path):
-    write_events(tmp_path / "a.npz", EVENTS, 34, 34)
-    with pytest.raises(ValueError, match="at most max_bytes=100 are read"):
-        read_events(tmp_path / "a.npz", max_bytes=100)
-
-
 def test_a_flipped_bit_in_stored_events_is_noticed_where_the_format_has_checksums(tmp_path):
     for name in ("a.npz", "a.h5"):
         write_events(tmp_path / name, EVENTS, 34, 34)
         good = (tmp_path / name).read_bytes()
         first, size = packed_x(tmp_path / name)
-        for place in range(first, first + size, 7):
+        for place in range(first, first + size, 17):
             bad = bytearray(good)
             bad[place] ^= 4
             (tmp_path / name).write_bytes(bad)

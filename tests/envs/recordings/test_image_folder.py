@@ -1,12 +1,8 @@
 """Events of folders of images: 8 and 16 bits, floating point, and the times of the images."""
 
 import base64
-import subprocess
-import warnings
 import zlib
-from pathlib import Path
 
-import imageio_ffmpeg
 import numpy as np
 import pytest
 from PIL import Image
@@ -45,9 +41,8 @@ def shown(lights: np.ndarray, times_us: list[int], **fields: object) -> np.ndarr
 
 
 @pytest.mark.parametrize(
-    ("suffix", "dtype"), [(".png", "u1"), (".tif", "u1"), (".ppm", "u1"), (".png", "u2"), (".tif", "u2"),
-                          (".ppm", "u2"), (".exr", "f4"), (".pfm", "f4")],
-)  # fmt: skip
+    ("suffix", "dtype"), [(".png", "u1"), (".ppm", "u1"), (".tif", "u2"), (".exr", "f4"), (".pfm", "f4")]
+)
 def test_values_are_read_as_they_are(suffix, dtype, tmp_path):
     if dtype == "f4":
         frames = np.random.default_rng(0).normal(0, 100, (2, *SHAPE, 3)).astype(np.float32)
@@ -82,42 +77,23 @@ def test_files_that_other_writers_made_are_read_as_they_are(tmp_path):
 
 
 def test_the_same_scene_in_8_bits_16_bits_and_floating_point_makes_the_same_events(tmp_path):
-    """8 bits and the same grey levels in 16 are equal; floating point differs by what quantising does."""
-    coarse = random_frames(8)
-    light = light_of_grey("srgb")[coarse]
-    files = [
-        quietly(save(tmp_path / "8", coarse, ".png"), fps=100.0),
-        quietly(save(tmp_path / "16", coarse.astype(np.uint16) * 257, ".png"), fps=100.0),
-        quietly(save(tmp_path / "f", light, ".exr"), fps=100.0),
-    ]
-    first = files[0].events
-    assert len(first) > 1000
-    for file in files[1:]:
-        assert np.array_equal(file.events, first)
-    times_us = [10_000 * n for n in range(8)]
-    assert np.array_equal(first, shown(light @ LUMA, times_us))
+    """Those of a camera that is shown the images in the order of their numbers: frame_2 before frame_10."""
+    coarse = random_frames(12)
+    fine, light = coarse.astype(np.uint16) * 257, light_of_grey("srgb")[coarse]
+    between = fine ^ 5  # levels that 8 bits do not have
+    for name, frames, seen in (
+        ("8", coarse, light),
+        ("16", fine, light),
+        ("float", light, light),
+        ("between", between, light_of_grey("srgb", 16)[between]),
+    ):
+        folder = save(tmp_path / name, frames, ".exr" if name == "float" else ".png")
+        expected = shown(seen @ LUMA, [round(n * 1e6 / 30) for n in range(12)])
+        assert len(expected) > 1000
+        assert np.array_equal(quietly(folder, fps=30.0).events, expected)
 
 
-def test_quantising_moves_a_pixel_by_less_than_an_event(tmp_path):
-    """Where a level of 8 bits is a small part of a threshold; 16 bits are closer than 8 by far."""
-    rng = np.random.default_rng(1)
-    scene = np.repeat(rng.uniform(0.3, 1.0, (9, *SHAPE, 1)), 3, axis=3)
-    folders = {
-        "8": save(tmp_path / "8", np.rint(scene * 255).astype(np.uint8), ".png"),
-        "16": save(tmp_path / "16", np.rint(scene * 65535).astype(np.uint16), ".png"),
-        "float": save(tmp_path / "float", scene.astype(np.float32), ".exr"),
-    }
-    camera = CameraConfig(width=16, height=12, contrast_threshold=0.1, luminance_floor=1e-3)
-    images, counts = {}, {}
-    for name, folder in folders.items():
-        events = quietly(folder, camera, transfer="linear", fps=100.0).events
-        images[name], counts[name] = np.zeros(SHAPE), len(events)
-        np.add.at(images[name], (events["y"], events["x"]), events["p"])
-    assert np.abs(images["8"] - images["float"]).max() <= 1
-    assert np.abs(images["16"] - images["float"]).max() <= 1
-    assert abs(counts["16"] - counts["float"]) < 0.1 * abs(counts["8"] - counts["float"]) + 5
-
-
+@pytest.mark.filterwarnings("ignore:.*events are missing:UserWarning")
 def test_the_times_of_a_list_are_those_of_the_events(tmp_path):
     """Uneven times, not from 0 on; the list has another order than the names, remarks, and a folder."""
     frames = random_frames(5)
@@ -127,9 +103,7 @@ def test_the_times_of_a_list_are_those_of_the_events(tmp_path):
     lines = [f"{t} images/frame_{n}.png" for t, n in zip(times_s, order, strict=True)]
     (tmp_path / "images.txt").write_text("# time [s] name\n\n" + "\r\n".join(lines) + "\n")
     times_us = [7_500_000, 7_500_001, 7_900_000, 1_468_941_032_123_457]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        steps = list(video_steps(tmp_path))
+    steps = list(video_steps(tmp_path))
     assert [step.t_us for step in steps] == times_us[1:]
     for start_us, step in zip(times_us[:-1], steps, strict=True):
         assert step.events["t"].min() > start_us
@@ -138,24 +112,6 @@ def test_the_times_of_a_list_are_those_of_the_events(tmp_path):
     assert np.array_equal(np.concatenate([step.events for step in steps]), shown(lights, times_us))
     even = quietly(tmp_path, fps=4.0)
     assert np.array_equal(even.events, shown(lights, [0, 250_000, 500_000, 750_000]))
-
-
-def test_without_a_list_images_are_in_the_order_of_their_numbers(tmp_path):
-    frames = random_frames(12)
-    save(tmp_path, frames, ".png")  # frame_10 before frame_2 in the alphabet
-    lights = light_of_grey("srgb")[frames] @ LUMA
-    times_us = [round(n * 1e6 / 30) for n in range(12)]
-    assert np.array_equal(quietly(tmp_path, fps=30.0).events, shown(lights, times_us))
-
-
-def test_fps_takes_the_place_of_the_times_of_a_video(tmp_path):
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24"]
-    command += ["-s", "16x12", "-r", "30", "-i", "-", "-c:v", "ffv1", "-pix_fmt", "bgr0"]
-    frames = random_frames()
-    subprocess.run([*command, str(tmp_path / "a.mkv")], input=frames.tobytes(), check=True)
-    lights = light_of_grey("srgb")[frames] @ LUMA
-    found = quietly(tmp_path / "a.mkv", fps=1000.0)
-    assert np.array_equal(found.events, shown(lights, [1000 * n for n in range(6)]))
 
 
 def test_light_brighter_than_white_and_negative_values_are_light_and_black(tmp_path):
@@ -172,9 +128,7 @@ def test_light_brighter_than_white_and_negative_values_are_light_and_black(tmp_p
     [
         (np.uint8, "srgb", 1e-3),
         (np.uint8, "linear", 10 / 255),
-        (np.uint16, "srgb", 1e-3),
         (np.uint16, "linear", 1e-3),
-        (np.float32, "linear", 1e-3),
         (np.float32, "srgb", 1e-3),
     ],
 )
@@ -190,34 +144,25 @@ def test_the_floor_is_right_for_what_the_camera_is_shown(dtype, transfer, floor,
         assert len(events) == int(np.log((value + used) / used) / 0.2) * SHAPE[0] * SHAPE[1]
 
 
-def write_list(folder: Path, text: str) -> Path:
-    save(folder, random_frames(3), ".png")
-    (folder / "images.txt").write_text(text)
-    return folder
-
-
 @pytest.mark.parametrize(
-    ("text", "rule"),
+    ("line", "rule"),
     [
-        ("0 frame_0.png\n0 frame_1.png\n", "times must increase"),
-        ("0.5 frame_0.png\n0.4 frame_1.png\n", "times must increase"),
-        ("0 frame_0.png\n", "has 1 images"),
-        ("", "has 0 images|is empty"),
-        ("0 frame_0.png\nlater frame_1.png\n", "line 2 must be time and name"),
-        ("0 frame_0.png\nnan frame_1.png\n", "line 2 must be time and name"),
-        ("0 frame_0.png\n-1 frame_1.png\n", "line 2 must be time and name"),
-        ("0 frame_0.png\n1e999999999 frame_1.png\n", "line 2 must be time and name"),
-        ("0 frame_0.png\n0.1\n", "line 2 must be time and name"),
-        ("0 frame_0.png\n1 ../frame_1.png\n", "not inside"),
-        ("0 frame_0.png\n1 /etc/passwd\n", "not inside"),
-        ("0 frame_0.png\n1 images.txt\n", "is no image"),
-        ("0 frame_0.png\n1 frame_9.png\n", "cannot be opened"),
-        ("0 frame_0.png\n1 a\0.png\n", "cannot be opened"),
-        ("0 frame_0.png\n1 .\n", "is no image"),
+        ("0 frame_1.png", "times must increase"),
+        ("", "has 1 images"),
+        ("nan frame_1.png", "line 2 must be time and name"),
+        ("-1 frame_1.png", "line 2 must be time and name"),
+        ("1e999999999 frame_1.png", "line 2 must be time and name"),
+        ("0.1", "line 2 must be time and name"),
+        ("1 /etc/passwd", "not inside"),
+        ("1 images.txt", "is no image"),
+        ("1 frame_9.png", "cannot be opened"),
+        ("1 a\0.png", "cannot be opened"),
+        ("1 .", "is no image"),
     ],
 )
-def test_a_list_that_breaks_a_rule_is_refused_by_name(text, rule, tmp_path):
-    folder = write_list(tmp_path / "a", text)
+def test_a_list_that_breaks_a_rule_is_refused_by_name(line, rule, tmp_path):
+    folder = save(tmp_path / "a", random_frames(3), ".png")
+    (folder / "images.txt").write_text(f"0 frame_0.png\n{line}\n")
     with pytest.raises(ValueError, match=rule) as error:
         video_to_events(folder)
     assert str(folder) in str(error.value)
@@ -230,7 +175,7 @@ def test_any_damage_of_a_list_is_refused_by_name_or_leaves_a_list(tmp_path):
         (tmp_path / name).write_bytes(b"a")
     listed, rng = tmp_path / "images.txt", np.random.default_rng(0)
     good, results = "\n".join(f"{n * 0.04:.6f} {name}" for n, name in enumerate(names * 5)).encode(), []
-    for _ in range(3000):
+    for _ in range(300):
         listed.write_bytes(damaged(good, [good, rng.bytes(50)], rng) or b"\n")
         try:
             paths, times_us = find_images(tmp_path, None, 1 << 20)
@@ -243,16 +188,14 @@ def test_any_damage_of_a_list_is_refused_by_name_or_leaves_a_list(tmp_path):
             assert all(path.is_file() and path.is_relative_to(tmp_path) for path in paths)
             assert all(0 <= t_us < 1 << 52 for t_us in times_us)
             results.append(True)
-    assert 30 < sum(results) < 2970
+    assert 0 < sum(results) < 300
 
 
 def test_folders_that_are_no_sequence_are_refused(tmp_path):
-    empty = tmp_path / "empty"
-    empty.mkdir()
     with pytest.raises(ValueError, match="has 0 images"):
-        video_to_events(empty, fps=10.0)
+        video_to_events(tmp_path, fps=10.0)
     folder = save(tmp_path / "a", random_frames(3), ".png")
-    for fps in (0.0, -1.0, np.inf, np.nan, 2e6):
+    for fps in (0.0, np.inf, np.nan, 2e6):
         with pytest.raises(ValueError, match="fps must lie in"):
             video_to_events(folder, fps=fps)
     with pytest.raises(ValueError, match="most max_bytes=100"):
@@ -266,15 +209,12 @@ def test_images_that_are_damaged_or_differ_are_refused(tmp_path):
         (folder / "frame_2.png").write_bytes(bad)
         with pytest.raises(ValueError, match=str(folder)):
             quietly(folder, fps=10.0)
-    Image.fromarray(np.zeros((13, 16, 3), np.uint8)).save(folder / "frame_2.png")
-    with pytest.raises(ValueError, match="change their size or depth"):
-        quietly(folder, fps=10.0)
-    Image.fromarray(np.zeros(SHAPE, np.uint16)).save(folder / "frame_2.png")
-    with pytest.raises(ValueError, match="change their size or depth"):
-        quietly(folder, fps=10.0)
-    for bad in (np.nan, np.inf, -np.inf):
+    for other in (np.zeros((13, 16, 3), np.uint8), np.zeros(SHAPE, np.uint16)):
+        Image.fromarray(other).save(folder / "frame_2.png")
+        with pytest.raises(ValueError, match="change their size or depth"):
+            quietly(folder, fps=10.0)
+    for bad, camera in ((np.nan, None), (np.inf, CameraConfig(width=4, height=3)), (-np.inf, None)):
         frames = np.ones((3, *SHAPE, 3), np.float32)
         frames[1, 5, 5] = bad
-        for camera in (None, CameraConfig(width=4, height=3)):
-            with pytest.raises(ValueError, match="frame 1 has values that are not finite"):
-                video_to_events(save(tmp_path / "b", frames, ".exr"), camera, fps=10.0)
+        with pytest.raises(ValueError, match="frame 1 has values that are not finite"):
+            video_to_events(save(tmp_path / "b", frames, ".exr"), camera, fps=10.0)

@@ -1,7 +1,5 @@
 """Frames between two frames, by optical flow."""
 
-import sys
-
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
@@ -74,14 +72,10 @@ def test_moments_between_lie_evenly_and_a_still_scene_has_none():
         assert np.corrcoef(picture[inner].ravel(), other[inner].ravel())[0, 1] > 0.97
 
 
-def test_pictures_that_are_too_small_another_word_and_no_opencv_are_refused(tmp_path, monkeypatch):
+def test_pictures_that_are_too_small_and_another_word_are_refused(tmp_path):
     folder = save(tmp_path, np.zeros((2, 12, 16, 3), np.uint8), ".png")
     with pytest.raises(ValueError, match="interpolate must be 'linear' or 'flow'"):
         quietly(folder, fps=10.0, interpolate="cubic")
-    monkeypatch.setitem(sys.modules, "cv2", None)
-    with pytest.raises(ValueError, match="needs OpenCV; pip install"):
-        quietly(folder, fps=10.0, interpolate="flow")
-    monkeypatch.undo()
     pytest.importorskip("cv2")
     with pytest.raises(ValueError, match="needs 32 x 32 pixels, got"):
         quietly(folder, fps=10.0, interpolate="flow")

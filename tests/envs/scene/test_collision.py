@@ -1,4 +1,3 @@
-import dataclasses
 import itertools
 import math
 
@@ -8,11 +7,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from envs.scene import BOX, CONE, ELLIPSOID, OBSTACLE, POLE, Scene, make_scene
-from envs.scene.collision import CELL_M, first_contact, keep_apart, ways_to_goal
+from envs.scene.collision import CELL_M, first_contact, ways_to_goal
 from envs.scene.obstacles import edge_sections
 
 metres = st.floats(-20.0, 20.0)
-NOTHING = np.empty((0, 7))
 
 
 def scene_of(*bodies: tuple, **fields) -> Scene:
@@ -52,7 +50,7 @@ sections = st.builds(
 )
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100)
 @given(
     rows=st.lists(sections, max_size=4),
     a=st.tuples(metres, metres),
@@ -74,7 +72,7 @@ def test_first_contact_agrees_with_dense_samples_of_the_segment(rows, a, b, radi
         assert min(distances(rows, at)[0], 15.0 - abs(at[0, 0])) <= radius + 1e-9
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100)
 @given(
     angle=st.floats(-math.pi, math.pi),
     length=st.floats(-9.0, 6.0).map(lambda exponent: 10.0**exponent),
@@ -96,13 +94,6 @@ def test_contact_is_exact_from_a_nanometre_to_a_thousand_kilometres(angle, lengt
     )
 
 
-def test_a_step_of_a_thousand_kilometres_stops_at_the_first_body_on_its_way():
-    scene = scene_of((BOX, 0.0, 1000.0, 2.0, 1.0), pole(0.0, 2000.0), width_m=1e7)
-    assert scene.first_contact((0.0, 0.0), (0.0, 1e6), 0.3) == pytest.approx((1000.0 - 1.3) / 1e6, rel=1e-12)
-    assert scene.first_contact((2.3, 0.0), (2.3, 1e6), 0.3) == pytest.approx((1000.0 - 1.0) / 1e6, rel=1e-12)
-    assert scene.first_contact((2.3 + 1e-9, 0.0), (2.3 + 1e-9, 1e6), 0.3) == math.inf
-
-
 def test_touching_counts_and_a_miss_by_little_does_not():
     scene = scene_of(pole())
     assert scene.first_contact((1.0, 0.0), (1.0, 20.0), 0.5) == pytest.approx(0.5)
@@ -114,27 +105,17 @@ def test_touching_counts_and_a_miss_by_little_does_not():
     assert scene.first_contact((0.0, 0.0), (-29.0, 0.0), 0.5) == pytest.approx(0.5)
     assert scene.first_contact((5.0, 0.0), (5.0, 0.0), 0.5) == math.inf
     assert scene.first_contact((14.5, 0.0), (0.0, 0.0), 0.5) == 0.0
+    box = scene_of((BOX, 0.0, 10.0, 2.0, 1.0))
+    assert box.first_contact((2.5, 0.0), (2.5, 20.0), 0.5) == pytest.approx(0.45)
+    assert box.first_contact((2.5 + 1e-12, 0.0), (2.5 + 1e-12, 20.0), 0.5) == math.inf
 
 
-def test_a_box_is_touched_at_its_sides_and_rounds_its_corners():
-    scene = scene_of((BOX, 0.0, 10.0, 2.0, 1.0))
-    assert scene.first_contact((2.5, 0.0), (2.5, 20.0), 0.5) == pytest.approx(0.45)
-    assert scene.first_contact((2.5 + 1e-12, 0.0), (2.5 + 1e-12, 20.0), 0.5) == math.inf
-    assert scene.first_contact((-9.0, 10.0), (1.0, 10.0), 0.5) == pytest.approx(0.65)
-    assert scene.first_contact((1.0, 10.5), (1.0, 30.0), 0.0) == 0.0
-    for long, narrow in ((5.0, 0.1), (0.1, 5.0)):  # inside, near every corner
-        thin = scene_of((BOX, 0.0, 10.0, long, narrow))
-        for x, y in itertools.product((-0.99 * long, 0.99 * long), (10 - 0.99 * narrow, 10 + 0.99 * narrow)):
-            assert thin.first_contact((x, y), (x, y + 0.01), 0.0) == 0.0
-
-
-@pytest.mark.parametrize("right", [1.0, -1.0])
-@pytest.mark.parametrize("ahead", [1.0, -1.0])
-def test_a_diagonal_way_grazes_the_corners_of_a_box(right, ahead):
+def test_a_diagonal_way_grazes_the_corners_of_a_box():
     scene = scene_of((BOX, 0.0, 0.0, 2.0, 1.0))
     corner = math.sqrt(0.5) * 0.5
     x, y = 2.0 + corner, 1.0 + corner  # on the disc around the corner, whose tangent is a diagonal
-    for past, hit in ((1e-9, False), (-1e-9, True)):
+    signs, cases = (1.0, -1.0), ((1e-9, False), (-1e-9, True))
+    for right, ahead, (past, hit) in itertools.product(signs, signs, cases):
         start, end = (right * (x + 3 + past), ahead * (y - 3)), (right * (x - 3 + past), ahead * (y + 3))
         assert scene.collides(start, end, 0.5) is hit
 
@@ -155,42 +136,23 @@ def test_a_vehicle_of_no_size_is_stopped_by_an_edge_of_no_width():
         (ELLIPSOID, lambda up: 0.5 * math.sqrt(1 - ((up - 4) / 4) ** 2)),
     ],
 )
-@pytest.mark.parametrize("height", [0.0, 1.0, 2.0, 4.0, 7.9, 8.0])
-def test_contact_is_with_what_stands_at_the_height_of_the_flight(kind, radius_at, height):
+def test_contact_is_with_what_stands_at_the_height_of_the_flight_and_above_all_with_walls_alone(
+    kind, radius_at
+):
     scene = scene_of((kind, 0.0, 10.0, 0.5, 0.5))
-    expected = (10.0 - radius_at(height) - 0.3) / 20.0
-    assert scene.first_contact((0.0, 0.0), (0.0, 20.0), 0.3, height) == pytest.approx(expected)
-
-
-@pytest.mark.parametrize("kind", [POLE, CONE, ELLIPSOID, BOX])
-def test_above_everything_there_are_only_the_walls(kind):
-    scene = scene_of((kind, 0.0, 10.0, 0.5, 0.5))
-    for height in (math.nextafter(8.0, 9.0), 100.0, -1.0):
+    for height in (0.0, 2.0, 7.9, 8.0):
+        expected = (10.0 - radius_at(height) - 0.3) / 20.0
+        assert scene.first_contact((0.0, 0.0), (0.0, 20.0), 0.3, height) == pytest.approx(expected)
+    for height in (math.nextafter(8.0, 9.0), -1.0):
         assert scene.first_contact((0.0, 0.0), (0.0, 20.0), 0.3, height) == math.inf
         assert scene.first_contact((0.0, 0.0), (20.0, 0.0), 0.3, height) == pytest.approx(14.7 / 20.0)
 
 
-def test_a_lintel_lets_the_vehicle_through_below_and_above_it():
-    rows = [(BOX, 0.0, 10.0, 3.0, 2.0, 0.2, 0.5, 0.25)]
-    scene = Scene("hand", np.array(rows, OBSTACLE))
-    hits = [scene.collides((0.0, 0.0), (0.0, 20.0), 0.3, height) for height in (2.0, 2.5, 3.0, 3.5, 4.0)]
-    assert hits == [False, True, True, True, False]
-
-
-def test_no_obstacles_and_ten_thousand_are_possible():
-    assert scene_of().first_contact((0.0, 0.0), (0.0, 1e6), 0.3) == math.inf
-    many = [pole(x, y, 0.2) for x in range(100) for y in range(100)]
-    scene = scene_of(*many, width_m=1e3)
-    assert scene.first_contact((0.0, -5.0), (0.0, 200.0), 0.3) == pytest.approx(4.5 / 205.0)
-    assert scene.first_contact((0.5, -5.0), (0.5, 200.0), 0.3 - 1e-12) == math.inf
-    assert scene.passable(0.3) is False  # no place but exactly the middle of the lanes
-
-
-@pytest.mark.parametrize("name", ["poles", "gates", "dynamic"])
+@pytest.mark.parametrize("name", ["poles", "gates"])
 def test_a_step_without_contact_never_ends_where_the_next_begins_in_contact(name):
     scene = make_scene(name, np.random.default_rng(1))
     rng = np.random.default_rng(2)
-    for _ in range(5000):
+    for _ in range(2000):
         x, y, _, _, hx, hy, r = scene.sections(2.0)[rng.integers(len(scene.sections(2.0)))]
         angle = rng.uniform(0, 2 * np.pi)
         reach = r + 0.3
@@ -235,11 +197,10 @@ def test_a_way_that_is_promised_touches_nothing_also_half_a_cell_beside_it(name)
     rng = np.random.default_rng(0)
     scene = make_scene(name, rng)
     leads = scene.ways_to_goal(0.3)
-    for start in rng.choice(np.flatnonzero(leads[0]), 12):
+    for start in rng.choice(np.flatnonzero(leads[0]), 5):
         way = lattice_way(leads, start, rng)
         way[:, 0] += rng.choice([-0.5, 0.0, 0.5]) * CELL_M
-        contacts = [scene.collides(a, b, 0.3) for a, b in itertools.pairwise(way)]
-        assert not any(contacts)
+        assert not any(scene.collides(a, b, 0.3) for a, b in itertools.pairwise(way))
         assert way[-1, 1] >= scene.length_m
 
 
@@ -248,9 +209,7 @@ def search(scene: Scene, radius: float, step: float, starts: np.ndarray) -> np.n
     rows = math.ceil(scene.length_m / step)
     found = []
     for start in starts:
-        front = {0}
-        if scene.collides((start, 0.0), (start, 0.0), radius):
-            front = set()
+        front = set() if scene.collides((start, 0.0), (start, 0.0), radius) else {0}
         for row in range(rows):
             front = {
                 k + move
@@ -266,7 +225,7 @@ def search(scene: Scene, radius: float, step: float, starts: np.ndarray) -> np.n
 
 def test_the_lattice_agrees_with_an_exact_search():
     starts, promises = np.array([-1.03, 0.0, 0.77]), []
-    for seed in range(8):
+    for seed in range(5):
         rng = np.random.default_rng(seed)
         kinds, radii = rng.choice([POLE, BOX, CONE, ELLIPSOID], 20), rng.uniform(0.2, 0.7, 20)
         places = rng.uniform((-3, 1), (3, 9), (20, 2))
@@ -282,36 +241,15 @@ def test_the_lattice_agrees_with_an_exact_search():
     assert 0.2 < np.mean(promises) < 0.8
 
 
-def test_a_wall_across_the_lane_lets_nobody_through_and_a_door_does():
-    wall = scene_of((BOX, 0.0, 50.0, 15.0, 0.2))
-    assert not wall.passable(0.0)
-    door = scene_of((BOX, -8.0, 50.0, 7.0, 0.2), (BOX, 8.0, 50.0, 7.0, 0.2))
-    assert door.passable(0.3)
-    assert door.passable(1.0 - 1.5 * CELL_M - 1e-9)
-    assert not door.passable(1.0)
-    assert wall.passable(0.3, height_m=9.0)
-
-
-def test_a_door_may_be_too_far_to_a_side_for_forty_five_degrees():
-    # From x = 0 a door at x = d can be reached only if it is at least d ahead.
-    for aside, reached in ((10.0, True), (10.6, False)):
-        bars = [(BOX, *bar) for bar in ((aside - 14.5, 10.0, 13.5, 0.01), (aside + 14.5, 10.0, 13.5, 0.01))]
-        scene = scene_of(*bars, width_m=60.0, spawn_range_m=(0.0, 0.0))
-        assert scene.passable(0.3) is reached
-
-
-@pytest.mark.parametrize(("x", "passable"), [(11.2, True), (11.05, False), (0.0, False), (-11.05, False)])
+@pytest.mark.parametrize(("x", "passable"), [(11.2, True), (11.05, False), (-11.05, False)])
 def test_every_start_counts_to_the_very_ends_of_the_range(x, passable):
     scene = scene_of((BOX, x, 0.0, 0.7, 0.5))  # starts end at 10 m; 0.3 m and a cell must be free
     assert scene.passable(0.3) is passable
-
-
-def test_a_lane_narrower_than_its_starts_is_not_passable():
     assert scene_of(width_m=20.9).passable(0.3)
-    assert not scene_of(width_m=20.5).passable(0.3)
+    assert not scene_of(width_m=20.5).passable(0.3), "a lane narrower than its starts"
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=60)
 @given(row=sections, radius=st.floats(0.0, 1.0))
 def test_places_are_closed_by_their_distance_to_a_section(row, radius):
     row = np.array([row]) + np.array([0, 5.0, 0, 0, 0, 0, 0])
@@ -323,24 +261,6 @@ def test_places_are_closed_by_their_distance_to_a_section(row, radius):
     assert not closed[inner][gaps[inner] > 1e-9].any()
 
 
-def test_mirrored_corridors_are_passable_alike():
-    scene = make_scene("poles_dense", np.random.default_rng(3))
-    turned = scene.obstacles.copy()
-    turned["x"] *= -1
-    mirrored = dataclasses.replace(scene, obstacles=turned)
-    assert (scene.ways_to_goal(0.3) == mirrored.ways_to_goal(0.3)[:, ::-1]).all()
-
-
 def test_far_away_bodies_are_no_obstacle_to_the_lattice():
     scene = scene_of(pole(1e300, 0.0), pole(0.0, -1e300), pole(3.0, 1e18, 5.0))
     assert scene.passable(0.3)
-
-
-def test_points_are_kept_in_order_and_apart():
-    tries = np.random.default_rng(0).uniform(0, 10, (1000, 2))
-    kept = keep_apart(tries, 1.0, 30)
-    gaps = np.hypot(*(kept[:, None] - kept[None]).transpose(2, 0, 1))
-    assert gaps[~np.eye(30, dtype=bool)].min() >= 1.0
-    assert kept[0].tolist() == tries[0].tolist()
-    assert len(keep_apart(tries, 20.0, 30)) == 1
-    assert keep_apart(tries, 1.0, 0).shape == (0, 2)

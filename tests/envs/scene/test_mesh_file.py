@@ -4,12 +4,14 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image
+from trimesh.visual.material import PBRMaterial
 
 from envs.scene import make_scene
 from envs.scene import mesh_file as meshfile
-from envs.scene.mesh_file import PLAIN_ALBEDO, is_mesh_path, read_mesh
+from envs.scene.mesh_file import PLAIN_ALBEDO, read_mesh
 
 GREY = 188  # of 255 in sRGB: 0.5 in linear light
+HALF_GREY = Image.fromarray(np.repeat(np.uint8([[0, 0, GREY, GREY]] * 4)[..., None], 3, axis=2))
 TRIANGLE = trimesh.Trimesh([(0, 0, 0), (1, 0, 0), (0, 2, 0)], [(0, 1, 2)], process=False)
 
 
@@ -40,13 +42,6 @@ def test_every_format_gives_the_same_surfaces_with_normals_outside(tmp_path, suf
     assert albedo == pytest.approx(PLAIN_ALBEDO)
 
 
-def test_gltf_is_turned_so_that_its_up_is_up_and_its_forward_is_ahead(tmp_path):
-    mesh = trimesh.Trimesh([(3, 7, -11), (4, 7, -11), (3, 8, -11)], [(0, 1, 2)], process=False)
-    corners, normals, _ = read_mesh(saved(tmp_path, mesh, "t.glb"))
-    assert corners[0].tolist() == [[3, 11, 7], [4, 11, 7], [3, 11, 8]]
-    assert normals[0] == pytest.approx([0, -1, 0])  # towards the viewer, as +z was
-
-
 def test_parts_stand_where_the_file_places_them_also_mirrored(tmp_path):
     scene = trimesh.Scene()
     ball = trimesh.creation.icosphere(1)
@@ -57,36 +52,33 @@ def test_parts_stand_where_the_file_places_them_also_mirrored(tmp_path):
     assert ((corners.mean(axis=1) - middle) * normals).sum(axis=1).min() > 0.5
 
 
-def test_colours_of_vertices_and_faces_are_made_linear(tmp_path):
-    coloured = TRIANGLE.copy()
-    coloured.visual.vertex_colors = [(GREY,) * 3 + (255,), (255, 255, 255, 255), (0, 0, 0, 255)]
-    assert read_mesh(saved(tmp_path, coloured, "v.ply"))[2][0] == pytest.approx([0.5, 1.0, 0.0], abs=3e-3)
-    by_face = TRIANGLE.copy()
-    by_face.visual.face_colors = [(255, 0, 0, 255)]
-    assert read_mesh(saved(tmp_path, by_face, "f.ply"))[2][0] == pytest.approx([0.2126] * 3)
+def painted(**fields):
+    """The triangle in a colour for each vertex or face, or in a material."""
+    mesh = TRIANGLE.copy()
+    if "material" in fields:
+        mesh.visual = trimesh.visual.TextureVisuals(uv=[(0, 0), (1, 0), (0, 1)], **fields)
+    for name, colours in fields.items():
+        setattr(mesh.visual, name, colours)
+    return mesh
 
 
-def test_colours_of_gltf_are_linear_already(tmp_path):
-    coloured = TRIANGLE.copy()
-    coloured.visual.vertex_colors = [(128, 128, 128, 255)] * 3
-    assert read_mesh(saved(tmp_path, coloured, "v.glb"))[2][0] == pytest.approx([128 / 255] * 3)
-    plain = TRIANGLE.copy()
-    plain.visual = trimesh.visual.TextureVisuals(
-        material=trimesh.visual.material.PBRMaterial(baseColorFactor=[0, 128, 0, 255])
-    )
-    assert read_mesh(saved(tmp_path, plain, "m.glb"))[2][0] == pytest.approx([0.7152 * 128 / 255] * 3)
-
-
-def test_a_texture_is_read_at_the_corners_and_made_linear(tmp_path):
-    pixels = np.zeros((4, 4, 3), np.uint8)
-    pixels[:, 2:] = GREY
-    textured = TRIANGLE.copy()
-    material = trimesh.visual.material.PBRMaterial(
-        baseColorTexture=Image.fromarray(pixels), baseColorFactor=[128, 128, 128, 255]
-    )
-    textured.visual = trimesh.visual.TextureVisuals(uv=[(0, 0), (1, 0), (0, 1)], material=material)
-    albedo = read_mesh(saved(tmp_path, textured, "t.glb"))[2]
-    assert albedo[0] == pytest.approx([0.0, 0.5 * 128 / 255, 0.0], abs=3e-3)
+@pytest.mark.parametrize(
+    ("mesh", "suffix", "albedo"),
+    [
+        (painted(vertex_colors=[(GREY,) * 3 + (255,), (255,) * 4, (0, 0, 0, 255)]), "ply", [0.5, 1.0, 0.0]),
+        (painted(face_colors=[(255, 0, 0, 255)]), "ply", [0.2126] * 3),
+        (painted(vertex_colors=[(128, 128, 128, 255)] * 3), "glb", [128 / 255] * 3),
+        (painted(material=PBRMaterial(baseColorFactor=[0, 128, 0, 255])), "glb", [0.7152 * 128 / 255] * 3),
+        (
+            painted(material=PBRMaterial(baseColorTexture=HALF_GREY, baseColorFactor=[128, 128, 128, 255])),
+            "glb",
+            [0.0, 0.5 * 128 / 255, 0.0],
+        ),
+    ],
+    ids=["vertices in sRGB", "faces in sRGB", "vertices of glTF", "factor of glTF", "texture in sRGB"],
+)
+def test_colours_are_made_linear_and_those_of_gltf_are_so_already(tmp_path, mesh, suffix, albedo):
+    assert read_mesh(saved(tmp_path, mesh, f"t.{suffix}"))[2][0] == pytest.approx(albedo, abs=3e-3)
 
 
 def test_triangles_without_area_are_left_out(tmp_path):
@@ -107,19 +99,18 @@ def refusal(path):
 def test_what_is_no_mesh_is_refused_with_one_message(tmp_path):
     assert "no such file" in refusal(tmp_path / "missing.glb")
     assert "no such file" in refusal(tmp_path)
-    (tmp_path / "notes.txt").write_text("a tree")
-    assert "formats" in refusal(tmp_path / "notes.txt")
+    for name, text, rule in (
+        ("notes.txt", "a tree", "formats"),
+        ("empty.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n", "triangles"),
+        ("nothing.obj", "", ""),
+        ("far.obj", "v 0 0 0\nv 1e9 0 0\nv 0 1 0\nf 1 2 3\n", "finite"),
+        ("nan.obj", "v 0 0 0\nv nan 0 0\nv 0 1 0\nf 1 2 3\n", "finite"),
+    ):
+        (tmp_path / name).write_text(text)
+        assert rule in refusal(tmp_path / name)
     for name in ("broken.glb", "broken.stl", "broken.ply", "broken.gltf"):
         (tmp_path / name).write_bytes(b"\x00solid nothing" * 9)
         assert any(rule in refusal(tmp_path / name) for rule in ("cannot be read", "triangles, got none"))
-    (tmp_path / "empty.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n")
-    assert "triangles" in refusal(tmp_path / "empty.obj")
-    (tmp_path / "nothing.obj").write_text("")
-    refusal(tmp_path / "nothing.obj")
-    (tmp_path / "far.obj").write_text("v 0 0 0\nv 1e9 0 0\nv 0 1 0\nf 1 2 3\n")
-    assert "finite" in refusal(tmp_path / "far.obj")
-    (tmp_path / "nan.obj").write_text("v 0 0 0\nv nan 0 0\nv 0 1 0\nf 1 2 3\n")
-    assert "finite" in refusal(tmp_path / "nan.obj")
 
 
 def test_a_file_that_is_too_large_is_refused_before_it_is_read(tmp_path, monkeypatch):
@@ -146,13 +137,3 @@ def test_a_gltf_that_names_a_remote_address_is_refused(tmp_path):
     header = {"asset": {"version": "2.0"}, "buffers": [{"uri": "http://localhost:1/x.bin", "byteLength": 36}]}
     (tmp_path / "deep" / "t.gltf").write_text(json.dumps(header))
     assert "cannot be read" in refusal(tmp_path / "deep" / "t.gltf")
-
-
-def test_a_name_with_a_suffix_or_a_folder_is_a_file():
-    assert [is_mesh_path(name) for name in ("a.glb", "b/c", "/d", "moon", "")] == [
-        True,
-        True,
-        True,
-        False,
-        False,
-    ]

@@ -6,8 +6,8 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from envs.scene import BOX, CONE, ELLIPSOID, OBSTACLE, POLE
-from envs.scene.obstacles import body_sections, checked_mesh, checked_obstacles, edge_sections, mesh_sections
+from envs.scene import BOX, CONE, ELLIPSOID, OBSTACLE, POLE, obstacles
+from envs.scene.obstacles import body_sections, checked_mesh, checked_obstacles, mesh_sections
 
 
 def body(kind, x=1.0, y=2.0, z=3.0, rx=0.5, ry=0.5, rz=2.0, albedo=0.25):
@@ -37,7 +37,7 @@ def area(section):
 
 
 @pytest.mark.parametrize("kind", [POLE, CONE, ELLIPSOID, BOX])
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=8)
 @given(height=st.floats(1.05, 4.95), ry=st.floats(0.1, 2.0))
 def test_a_section_has_the_area_that_a_plane_cuts_from_a_mesh_of_the_body(kind, height, ry):
     record = body(kind, ry=ry if kind == BOX else 0.5)
@@ -48,18 +48,7 @@ def test_a_section_has_the_area_that_a_plane_cuts_from_a_mesh_of_the_body(kind, 
     assert tuple(section[:4]) == (1.0, 2.0, 1.0, 0.0)
 
 
-@pytest.mark.parametrize("kind", [POLE, CONE, ELLIPSOID, BOX])
-def test_a_body_ends_with_its_bottom_and_its_top(kind):
-    record = body(kind)
-    for height, reached in ((1.0, 1), (5.0, 1), (math.nextafter(1.0, 0), 0), (math.nextafter(5.0, 9), 0)):
-        assert len(body_sections(record, height)) == reached
-    tip = body_sections(record, 5.0)[0, 6]
-    assert tip == {POLE: 0.5, CONE: 0.0, ELLIPSOID: 0.0, BOX: 0.0}[kind]
-    foot = body_sections(record, 1.0)[0, 6]
-    assert foot == {POLE: 0.5, CONE: 0.5, ELLIPSOID: 0.0, BOX: 0.0}[kind]
-
-
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60)
 @given(z=st.floats(-1e3, 1e3), rz=st.floats(1e-6, 1e3), share=st.floats(-1.0, 1.0))
 def test_rounding_never_makes_a_section_wider_than_its_body(z, rz, share):
     for kind in (CONE, ELLIPSOID):
@@ -68,7 +57,7 @@ def test_rounding_never_makes_a_section_wider_than_its_body(z, rz, share):
         assert np.isfinite(sections).all()
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15)
 @given(height=st.floats(-1.2, 1.2), seed=st.integers(0, 1000))
 def test_a_mesh_is_cut_as_trimesh_cuts_it(height, seed):
     mesh = trimesh.creation.icosphere(2)
@@ -85,43 +74,36 @@ def test_a_mesh_is_cut_as_trimesh_cuts_it(height, seed):
         assert apart.max() < 1e-9
 
 
-def test_faces_that_only_touch_the_plane_count():
+@pytest.mark.parametrize(
+    ("lifts", "lengths"),
+    [
+        ((0, 0, 0), [3.0, 4.0, 5.0]),
+        ((0, 0, 4), [4.0]),
+        ((0, 1, 5), [0.0]),
+        ((0, 1, -1), [2.5]),
+        ((1, 1, 1), []),
+    ],
+    ids=["lies in it", "has an edge in it", "has a corner in it", "is cut through a corner", "is above it"],
+)
+def test_faces_that_only_touch_the_plane_count(lifts, lengths):
     triangle = np.array([(0.0, 0.0, 1.0), (4.0, 0.0, 1.0), (0.0, 3.0, 1.0)])
-    lying = mesh_sections(triangle, np.array([[0, 1, 2]]), 1.0)
-    assert sorted(2 * lying[:, 4]) == pytest.approx([3.0, 4.0, 5.0])
-    on_edge = mesh_sections(
-        triangle - (0, 0, 1) + np.array([[0, 0, 1], [0, 0, 1], [0, 0, 5]]), np.array([[0, 1, 2]]), 1.0
-    )
-    assert 2 * on_edge[:, 4] == pytest.approx([4.0])
-    on_corner = mesh_sections(
-        triangle + np.array([[0, 0, 0], [0, 0, 1], [0, 0, 5]]), np.array([[0, 1, 2]]), 1.0
-    )
-    assert on_corner[:, (0, 1, 4)].tolist() == [[0.0, 0.0, 0.0]]
-    through_corner = mesh_sections(
-        triangle + np.array([[0, 0, 0], [0, 0, 1], [0, 0, -1]]), np.array([[0, 1, 2]]), 1.0
-    )
-    assert 2 * through_corner[:, 4] == pytest.approx([2.5])
-    assert mesh_sections(triangle, np.array([[0, 1, 2]]), 2.0).shape == (0, 7)
+    triangle[:, 2] += lifts
+    found = mesh_sections(triangle, np.array([[0, 1, 2]]), 1.0)
+    assert found.shape == (len(lengths), 7)
+    assert sorted(2 * found[:, 4]) == pytest.approx(lengths)
+    if lengths == [0.0]:
+        assert found.tolist() == [[0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0]], "an edge without length is a point"
     assert mesh_sections(triangle, np.empty((0, 3), np.int64), 1.0).shape == (0, 7)
 
 
-def test_neighbouring_faces_give_the_same_point_on_their_common_edge():
+def test_neighbouring_faces_give_the_same_point_on_their_common_edge_bit_for_bit(monkeypatch):
+    monkeypatch.setattr(obstacles, "edge_sections", lambda a_m, b_m: np.concatenate([a_m, b_m]))
     rng = np.random.default_rng(0)
-    for _ in range(200):
+    for _ in range(50):
         vertices = rng.normal(size=(4, 3))
         vertices[:2, 2] = (-0.3, 0.7)
-        faces = np.array([[0, 1, 2], [1, 0, 3]])
-        ends = []
-        for face in faces:
-            sections = mesh_sections(vertices, face[None], 0.0)
-            along = sections[0, 2:4] * sections[0, 4]
-            ends.append([sections[0, :2] - along, sections[0, :2] + along])
-        assert min(np.abs(a - b).max() for a in ends[0] for b in ends[1]) < 1e-15
-
-
-def test_an_edge_without_length_is_a_point():
-    point = edge_sections(np.array([[3.0, 4.0]]), np.array([[3.0, 4.0]]))
-    assert point.tolist() == [[3.0, 4.0, 1.0, 0.0, 0.0, 0.0, 0.0]]
+        ends = [mesh_sections(vertices, np.array([face]), 0.0) for face in ((0, 1, 2), (1, 0, 3))]
+        assert set(map(tuple, ends[0])) & set(map(tuple, ends[1]))
 
 
 @pytest.mark.parametrize(
@@ -129,13 +111,10 @@ def test_an_edge_without_length_is_a_point():
     [
         ({"kind": 4}, "kind must be below 4"),
         ({"x": math.nan}, "finite"),
-        ({"rz": math.inf}, "finite"),
         ({"rx": 0.0}, "must be > 0"),
-        ({"rz": -1.0}, "must be > 0"),
         ({"ry": 0.6}, "rx must equal ry"),
         ({"albedo": -0.1}, "albedo"),
-        ({"albedo": 0.9}, "albedo"),
-        ({"albedo": math.nan}, "finite"),
+        ({"albedo": 0.84}, "albedo.*contrast"),
     ],
 )
 def test_a_record_that_cannot_be_is_named(changes, message):
@@ -144,12 +123,7 @@ def test_a_record_that_cannot_be_is_named(changes, message):
         records[key][2] = value
     with pytest.raises(ValueError, match=f"(?s){message}.*record 2"):
         checked_obstacles(records, contrast=0.2)
-
-
-def test_the_brightest_obstacle_may_just_reach_one():
-    assert len(checked_obstacles(body(POLE, albedo=0.8), contrast=0.25)) == 1
-    with pytest.raises(ValueError, match="contrast"):
-        checked_obstacles(body(POLE, albedo=0.8), contrast=0.26)
+    assert len(checked_obstacles(body(POLE, albedo=0.8), contrast=0.25)) == 1, "it may just reach one"
 
 
 def test_a_mesh_that_cannot_be_is_refused_and_a_good_one_is_kept_unchangeable():

@@ -4,7 +4,7 @@ import math
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from envs.config import EnvConfig
@@ -24,29 +24,12 @@ def drawn(name, seed=0):
 def test_costs_obey_bellmans_equation_at_every_place(name):
     plan = cost_to_go(drawn(name), RADIUS_M, HEIGHT_M)
     rows, columns = plan.costs.shape
-    for row in range(rows - 1):
-        for column in range(1, columns - 1):
-            at = plan.first_x_m + column * LATTICE_M, row * LATTICE_M
-            best = plan.prices[row, column] + plan.of_actions(*at).min()
-            assert plan.costs[row, column] == pytest.approx(best, rel=1e-12)
+    rng = np.random.default_rng(0)
+    for row, column in zip(rng.integers(0, rows - 1, 1500), rng.integers(0, columns - 1, 1500), strict=True):
+        at = plan.first_x_m + column * LATTICE_M, row * LATTICE_M
+        best = plan.prices[row, column] + plan.of_actions(*at).min()
+        assert math.isclose(plan.costs[row, column], best, rel_tol=1e-12)
     np.testing.assert_array_equal(plan.costs[-1], plan.prices[-1])
-
-
-def test_costs_are_those_of_the_cheapest_of_all_ways():
-    prices = np.random.default_rng(3).uniform(size=(6, 5))
-
-    def cheapest(row, column):
-        if row == len(prices) - 1:
-            return prices[row, column]
-        ways = [
-            SIDE_PRICE * abs(side) + cheapest(row + 1, column + side)
-            for side in (-1, 0, 1)
-            if 0 <= column + side < 5
-        ]
-        return prices[row, column] + min(ways)
-
-    expected = [[cheapest(row, column) for column in range(5)] for row in range(6)]
-    np.testing.assert_allclose(_costs(prices), expected, rtol=1e-13)
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -54,7 +37,7 @@ def test_a_place_is_blocked_exactly_where_the_vehicle_is_in_contact_or_nearly(na
     scene = drawn(name)
     plan = cost_to_go(scene, RADIUS_M, HEIGHT_M)
     rng = np.random.default_rng(0)
-    for row, column in zip(rng.integers(0, 401, 400), rng.integers(0, plan.costs.shape[1], 400), strict=True):
+    for row, column in zip(rng.integers(0, 401, 200), rng.integers(0, plan.costs.shape[1], 200), strict=True):
         x, y = plan.first_x_m + column * LATTICE_M, row * LATTICE_M
         sizes = (RADIUS_M + 0.5 * LATTICE_M + nudge for nudge in (-1e-9, 1e-9))
         reaches = [scene.collides((x, y), (x, y), size, HEIGHT_M) for size in sizes]
@@ -80,6 +63,7 @@ def test_costs_between_places_are_bilinear_and_outside_those_of_the_edge():
     assert ahead == plan.of_actions(-0.4, 0.3)[0]
 
 
+@settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1), st.integers(2, 12), st.integers(2, 12), st.integers(1, 9))
 def test_with_limited_sight_costs_are_those_of_a_world_that_ends_there(seed, rows, columns, ahead):
     rng = np.random.default_rng(seed)
@@ -93,7 +77,7 @@ def test_with_limited_sight_costs_are_those_of_a_world_that_ends_there(seed, row
         np.testing.assert_array_equal(plan.of_actions(x, y, 1e9), plan.of_actions(x, y))
 
 
-def flown(scene, seed, random_share, plan=None, sight_m=math.inf, control_hz=200.0):
+def flown(scene, seed, random_share, plan=None, sight_m=math.inf, control_hz=50.0):
     """Whether the teacher's cheapest actions lead from a random start to the goal line."""
     plan = plan or cost_to_go(scene, RADIUS_M, HEIGHT_M)
     rng, config = np.random.default_rng(seed), EnvConfig()
@@ -110,17 +94,16 @@ def flown(scene, seed, random_share, plan=None, sight_m=math.inf, control_hz=200
 
 
 @pytest.mark.parametrize(
-    ("name", "random_share", "least"),
-    [("poles_eval", 0.0, 40), ("poles_eval", 0.3, 40), ("gates", 0.3, 40), ("poles_dense", 0.0, 40)],
+    ("name", "random_share"), [("poles_eval", 0.3), ("gates", 0.3), ("poles_dense", 0.0)]
 )
-def test_the_cheapest_actions_come_through(name, random_share, least):
-    assert sum(flown(drawn(name, seed), seed, random_share) for seed in range(40)) >= least
+def test_the_cheapest_actions_come_through(name, random_share):
+    assert all(flown(drawn(name, seed), seed, random_share) for seed in range(20))
 
 
-@pytest.mark.parametrize("control_hz", [25.0, 200.0])
-def test_five_metres_of_sight_suffice_among_dense_poles(control_hz):
-    flights = [flown(drawn("poles_dense", k), k, 0.0, sight_m=5.0, control_hz=control_hz) for k in range(40)]
-    assert all(flights)
+@pytest.mark.parametrize(("control_hz", "flights"), [(25.0, 20), (200.0, 5)])
+def test_five_metres_of_sight_suffice_among_dense_poles(control_hz, flights):
+    for k in range(flights):
+        assert flown(drawn("poles_dense", k), k, 0.0, sight_m=5.0, control_hz=control_hz)
 
 
 def test_a_row_is_priced_as_it_is_when_the_vehicle_comes_there():
@@ -146,7 +129,7 @@ def test_a_mesh_blocks_where_its_surfaces_are(tmp_path):
     scene = make_scene(str(tmp_path / "box.stl"), np.random.default_rng(0))
     plan = cost_to_go(scene, RADIUS_M, HEIGHT_M)
     assert plan.of_actions(0.0, 28.6).min() > BLOCKED
-    assert all(flown(scene, seed, 0.3, plan) for seed in range(10))
+    assert all(flown(scene, seed, 0.3, plan) for seed in range(5))
     left_of, right_of = plan.of_actions(-2.0, 25.75), plan.of_actions(2.0, 25.75)
     assert left_of.argmin() == 1
     assert right_of.argmin() == 2

@@ -26,28 +26,22 @@ def marched(sections, eye, heading):
     return math.inf
 
 
-def test_a_pole_ahead_is_as_near_as_its_surface():
-    assert proximity(pole(0, 10), (0, 0, 2, 0), [0.0]) == pytest.approx([math.exp(-9.5 / NEAR_M)])
-    assert proximity(pole(0, 10), (0, 0, 2, 0), [0.1, -0.1, math.pi]).tolist() == [0, 0, 0]
-    assert proximity(pole(0, 10), (0, 10.2, 2, 0), [0.0, 1.0]).tolist() == [1, 1]
-    assert proximity(pole(0, MAX_RANGE_M + 1), (0, 0, 2, 0), [0.0]).tolist() == [0]
-    assert proximity(pole(0, 10), (0, 0, 7, 0), [0.0]).tolist() == [0]  # over its top
-
-
-def test_bearings_are_to_the_right_and_yaw_turns_left():
-    right = proximity(pole(5, 5), (0, 0, 2, 0), [math.pi / 4, -math.pi / 4])
-    assert right[0] > 0.5
-    assert right[1] == 0
-    assert proximity(pole(5, 5), (0, 0, 2, 0.3), [math.pi / 4 + 0.3]) == pytest.approx(right[:1])
+def test_what_is_far_or_below_counts_nothing_and_inside_an_obstacle_all_is_near():
+    for y, distance, height, expected in (
+        (10.2, 10, 2, [1, 1]),
+        (0, MAX_RANGE_M + 1, 2, [0, 0]),
+        (0, 10, 7, [0, 0]),
+    ):
+        assert proximity(pole(0, distance), (0, y, height, 0), [0.0, 1.0]).tolist() == expected
 
 
 @pytest.mark.parametrize("name", ["poles", "cones", "gates", "shape_change"])  # each kind of body
 def test_it_agrees_with_marching_on_a_distance_function_and_with_rays_through_the_bodies(name):
     scene = make_scene(name, np.random.default_rng(1))
-    rng, pixels, focal = np.random.default_rng(2), 101, 50.0
+    rng, pixels, focal = np.random.default_rng(2), 51, 25.0
     bearings = np.arctan((np.arange(pixels) + 0.5 - 0.5 * pixels) / focal)
     hits = 0
-    for _ in range(6):
+    for _ in range(4):
         pose = (rng.uniform(-10, 10), rng.uniform(0, 90), 2.0, rng.uniform(-0.3, 0.3))
         near = proximity(scene, pose, bearings)
         if near.max() == 1.0:
@@ -60,7 +54,7 @@ def test_it_agrees_with_marching_on_a_distance_function_and_with_rays_through_th
         distance = np.where(body, seen.depth[0] / np.cos(bearings), np.inf)
         distance[distance > MAX_RANGE_M] = np.inf
         np.testing.assert_allclose(near, np.exp(-distance / NEAR_M), atol=1e-12)
-    assert hits > 50
+    assert hits > 20
 
 
 def test_sectors_share_the_field_of_view_evenly():
@@ -71,11 +65,10 @@ def test_sectors_share_the_field_of_view_evenly():
     np.testing.assert_allclose(bearings.mean(1), np.degrees(sector_bearings(90, 24)[:, 0]))
 
 
-def test_numbers_that_are_not_finite_are_refused():
+@pytest.mark.parametrize(("y", "bearing"), [(np.nan, 0.0), (0.0, np.inf)])
+def test_numbers_that_are_not_finite_are_refused(y, bearing):
     with pytest.raises(ValueError, match="must be finite, got"):
-        proximity(pole(0, 10), (0, np.nan, 2, 0), [0.0])
-    with pytest.raises(ValueError, match="must be finite, got"):
-        proximity(pole(0, 10), (0, 0, 2, 0), [np.inf])
+        proximity(pole(0, 10), (0, y, 2, 0), [bearing])
 
 
 def test_a_sector_is_as_near_as_the_nearest_of_its_rays(monkeypatch):

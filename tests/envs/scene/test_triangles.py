@@ -88,6 +88,9 @@ def test_the_mesh_of_a_scene_holds_every_part_once_and_its_own_mesh_as_it_is():
     np.testing.assert_array_equal(vertices[faces[-1]], own[0])
     np.testing.assert_array_equal(luminance[faces[-1]], own[2])
     assert len(faces) == sum(len(body_mesh(scene, body, 16)[1]) for body in BODIES) + 10 + 8 + 1
+    sides = np.hypot(*(vertices[:16, :2] - (1.0, 20.0)).T)  # a prism, on average as wide as its pole
+    np.testing.assert_allclose(sides, 0.5 * (np.pi / 16) / np.sin(np.pi / 16))
     mesh = to_trimesh(scene, 16).dump()[0]
     np.testing.assert_array_equal(mesh.vertex_attributes["luminance"], luminance.astype(np.float32))
+    assert np.abs(mesh.visual.vertex_colors[:, 0] / 255.0 - luminance).max() < 0.5 / 255 + 1e-6
     assert len(scene_mesh(Scene(name="empty", obstacles=BODIES[:0]))[1]) == 18

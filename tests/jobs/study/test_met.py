@@ -4,7 +4,7 @@ import itertools
 import pytest
 
 from envs.config import EnvConfig
-from jobs.config.conditions import WEIGHT, axis_points
+from jobs.config.conditions import axis_points
 from jobs.config.config import parse
 from jobs.config.env_keys import env_with
 from jobs.rollout.policies import find_study_policies
@@ -30,21 +30,17 @@ def was_met(conditions, changes):
     ("conditions", "changes", "expected"),
     [
         ([{}], {}, False),
-        ([{}], {"faults.sparsity": 0.2}, False),
         ([{}], {"env.scene": "poles"}, True),
         ([{}], {"env.scene": "poles_dense"}, False),
         ([{"faults.sparsity": [0.1, 0.5]}], {"faults.sparsity": 0.2}, True),
         ([{"faults.sparsity": [0.1, 0.5]}], {"faults.sparsity": 0.6}, False),
         ([{"faults.sparsity": {"low": 0.1, "high": 0.5}}], {"faults.sparsity": 0.5}, True),
         ([{"env.layout.num_obstacles": [60, 90]}], {"env.scene": "poles_dense"}, True),
-        ([{"env.scene": ["poles", "poles_dense"]}], {"env.scene": "poles_dense"}, True),
         ([{"env.scene": "texture_change"}], {"env.scene": "texture_change"}, True),
         ([{"env.layout.shape": ["box", "cone"]}], {"env.scene": "shape_change"}, False),
         ([{"camera.memory": "frame"}], {"camera.memory": "frame"}, True),
         ([{}, {"faults.sparsity": 0.3}], {"faults.sparsity": 0.2}, True),
-        ([{}, {"faults.sparsity": 0.3}], {"faults.sparsity": 0.4}, False),
         ([{"faults.sparsity": 0.3}], {"faults.sparsity": 0.2}, False),  # no episode has less
-        ([{"env.control_hz": 60}, {"env.control_hz": 300}], {"env.control_hz": 100}, True),
         ([{"env.control_hz": 60}, {"env.control_hz": 300}], {"env.control_hz": 45}, False),
     ],
 )
@@ -52,10 +48,10 @@ def test_a_cell_is_met_where_one_condition_may_draw_all_that_distinguishes_it(co
     assert was_met(conditions, changes) is expected
 
 
-@pytest.mark.parametrize(("delay_ms", "expected"), [(50.0, True), (25.0, False)])
-def test_what_a_training_always_had_it_has_met(delay_ms, expected):
-    trained = EnvConfig(action_delay_ms=50.0)
-    assert met([{}], trained, NOMINAL, env_with(NOMINAL, {"env.action_delay_ms": delay_ms})) is expected
+def test_what_a_training_always_had_it_has_met():
+    for delay_ms in (50.0, 25.0):
+        late = env_with(NOMINAL, {"env.action_delay_ms": delay_ms})
+        assert met([{}], EnvConfig(action_delay_ms=50.0), NOMINAL, late) is (delay_ms == 50.0)
 
 
 def test_what_two_conditions_meet_one_by_one_is_not_met_together():
@@ -72,11 +68,9 @@ def test_what_a_sweep_tests_as_unseen_never_occurs_in_the_training_that_holds():
     for conditions in (config.train.conditions, config.collect.conditions):
         for scene in NEVER_MET:
             assert not met(conditions, config.env, NOMINAL, dataclasses.replace(NOMINAL, scene=scene))
-        nominal = env_with(NOMINAL, {})
         for axis in swept_axes.values():
-            for key in axis:
-                swept = {point[key] for point in axis_points(axis)}
-                swept -= {value_of(nominal, key), "poles"}
+            for key in axis.keys() - {"fidelity.tolerance", "env.time_limit_s"}:
+                swept = {point[key] for point in axis_points(axis)} - {value_of(NOMINAL, key), "poles"}
                 drawn = itertools.chain(*(drawn_of(condition, key) for condition in conditions))
                 assert not swept & set(drawn), key
 
@@ -102,7 +96,5 @@ def value_of(env, key):
 
 
 def drawn_of(condition, key):
-    if key == "fidelity.tolerance" or key == "env.time_limit_s" or key == WEIGHT:
-        return []
     value = condition.get(key, [])
     return value if isinstance(value, list) else [value]

@@ -6,10 +6,9 @@ import pytest
 from envs.config import CameraConfig, EnvConfig, FidelityConfig, sensor_settings
 from jobs.config.conditions import NOMINAL
 from jobs.config.config import ConfigError
-from jobs.rollout.policies import PRETRAINED, find_study_policies, read_policy, with_sensor
-from jobs.rollout.tasks import text_of
+from jobs.rollout.policies import find_study_policies, read_policy, with_sensor
 from jobs.run.folder import open_run
-from jobs.study.plan import plan_study, was_met
+from jobs.study.plan import plan_study
 from jobs.study.record import _compared as compared
 from models.policy.policy import MANIFEST, read_policy_manifest
 from tests.support.configs import AXES, sweep_config
@@ -19,34 +18,24 @@ from tests.support.runs import planned
 OTHER_CAMERA = {"threshold_mismatch": 0.03, "threshold_seed": 1, "response": "lin_log", "encoding": "linear8"}
 
 
-def at(sweep, axis, value):
-    (task,) = [task for task in sweep.tasks if task.condition == (axis, value)]
-    return task
-
-
 def test_axes_change_their_settings_alone_and_share_the_unchanged_task(tmp_path):
     config = sweep_config(tmp_path)
     sweep = planned(config, save_training(tmp_path / "policy", "a", 0, config.env))
-    assert sweep.conditions == [
-        (NOMINAL, "poles_eval"), ("sparsity", 0), ("sparsity", 0.5), ("rate", 100), ("rate", 200)
-    ]  # fmt: skip
-    usual = at(sweep, NOMINAL, "poles_eval")
-    assert usual.key == at(sweep, "sparsity", 0).key == at(sweep, "rate", 200).key
+    found = {task.condition: task for task in sweep.tasks}
+    usual = found[NOMINAL, "poles_eval"]
     sparse = dataclasses.replace(usual.env.faults, sparsity=0.5)
-    assert at(sweep, "sparsity", 0.5).env == dataclasses.replace(usual.env, faults=sparse)
-    assert at(sweep, "rate", 100).env == dataclasses.replace(usual.env, control_hz=100.0)
+    envs = {
+        (NOMINAL, "poles_eval"): usual.env,
+        ("sparsity", 0): usual.env,
+        ("sparsity", 0.5): dataclasses.replace(usual.env, faults=sparse),
+        ("rate", 100): dataclasses.replace(usual.env, control_hz=100.0),
+        ("rate", 200): usual.env,
+    }
+    assert sweep.conditions == list(envs)
+    assert {at: task.env for at, task in found.items()} == envs
     assert len({task.key for task in sweep.tasks}) == 3
+    assert usual.key == found["sparsity", 0].key == found["rate", 200].key
     assert all(task.env.split == "eval" and task.seeds == (0, 1) for task in sweep.tasks)
-
-
-def test_faults_change_no_accuracy_and_anything_else_does(tmp_path):
-    sweep = planned(sweep_config(tmp_path), "straight", "oracle")
-    usual, sparse, slow = (
-        {task.simulation for task in sweep.tasks if task.condition == label}
-        for label in ((NOMINAL, "poles_eval"), ("sparsity", 0.5), ("rate", 100))
-    )
-    assert usual == sparse != slow
-    assert len(usual) == 1
 
 
 def test_another_policy_is_another_task(tmp_path):
@@ -59,23 +48,16 @@ def test_another_policy_is_another_task(tmp_path):
 
 
 def test_what_an_agent_does_not_see_makes_no_task_of_its_own(tmp_path):
-    axes = {
-        **AXES,
-        "threshold": {"camera.contrast_threshold": [0.2, 0.4]},
-        "exactness": {"fidelity.samples": [1, 8]},
-    }
-    config = sweep_config(tmp_path, axes=axes)
+    thresholds, exact = {"camera.contrast_threshold": [0.2, 0.4]}, {"fidelity.samples": [1, 8]}
+    config = sweep_config(tmp_path, axes={**AXES, "threshold": thresholds, "exactness": exact})
     agents = [save_training(tmp_path / name, name, 0, config.env, name) for name in ("rgb", "event_image")]
     sweep = planned(config, "straight", *agents)
     keys = {
         group: {task.condition: task.key for task in sweep.tasks if task.policy.group == group}
         for group in sweep.groups
     }
-    assert {group: len(set(found.values())) for group, found in keys.items()} == {
-        "straight": 2,  # the rate alone
-        "rgb": 4,  # and what a picture shows
-        "event_image": 6,
-    }
+    different = {group: len(set(found.values())) for group, found in keys.items()}
+    assert different == {"straight": 2, "rgb": 4, "event_image": 6}  # rates; what a picture shows; all
     assert keys["rgb"]["exactness", 8] != keys["rgb"][NOMINAL, "poles_eval"]
     errors = {task.simulation for task in sweep.tasks if task.condition == ("threshold", 0.4)}
     assert len(errors) == 1, "the condition is the same for all"
@@ -119,11 +101,9 @@ def test_a_policy_keeps_its_own_sensor_with_an_axis_changed_on_it(tmp_path):
 
 def test_an_own_sensor_that_an_axis_excludes_is_refused_with_both_named(tmp_path):
     config = sweep_config(tmp_path, axes={"dead_time": {"camera.refractory_us": [0, 10]}})
-    agent = save_training(
-        tmp_path / "policy", "a", 0, dataclasses.replace(config.env, camera=CameraConfig(memory="frame"))
-    )
+    framed = dataclasses.replace(config.env, camera=CameraConfig(memory="frame"))
     with pytest.raises(ConfigError, match=r"^study\.axes\.dead_time: .*refractory_us.* 10.*got 10$"):
-        planned(config, agent)
+        planned(config, save_training(tmp_path / "policy", "a", 0, framed))
 
 
 def test_every_sensor_setting_of_a_manifest_reaches_the_simulation():
@@ -139,22 +119,6 @@ def test_every_sensor_setting_of_a_manifest_reaches_the_simulation():
         assert sensor_settings(with_sensor(EnvConfig(), sensor)) == sensor
         assert sensor_settings(with_sensor(held, sensor)) == sensor
     assert differ == set(usual)
-
-
-def test_policies_of_one_group_stand_together_by_their_training_seed(tmp_path):
-    config = sweep_config(tmp_path)
-    folder, env = open_run(config), config.env
-    for place, group, seed in (("x", "b", 1), ("y", "a", 0), ("z", "b", 0)):
-        save_training(tmp_path / "pretrained" / place, group, seed, env)
-    named = sweep_config(tmp_path, policies=["pretrained", "oracle", "pretrained"])
-    policies = find_study_policies(named, folder, tmp_path / "pretrained")
-    assert [(policy.group, policy.training) for policy in policies] == [
-        ("b", 0),
-        ("b", 1),
-        ("a", 0),
-        ("oracle", None),
-    ]
-    assert plan_study(named, policies).groups == {"b": [0, 1], "a": [0], "oracle": [None]}
 
 
 def test_a_policy_without_an_experiment_is_of_the_group_of_its_kind(tmp_path):
@@ -174,58 +138,36 @@ def test_a_policy_is_named_by_its_folder_its_run_folder_or_as_the_newest(tmp_pat
         assert policy.agent == path
 
 
-def test_a_policy_is_found_by_its_name_in_the_pretrained_folder(tmp_path):
-    config = sweep_config(tmp_path, policies=["one"])
-    path = save_training(tmp_path / "pretrained" / "one", "a", 0, config.env)
-    (policy,) = find_study_policies(config, open_run(config), tmp_path / "pretrained")
-    assert policy.agent == path
+NAMED = [
+    (["pretrained", "oracle", "pretrained"], {"a": [0, 1], "a-set": [0], "oracle": [None]}),
+    (["a", "straight"], {"a": [0, 1], "straight": [None]}),
+    (["a-s1"], {"a": [1]}),
+]
 
 
-def test_a_group_of_the_pretrained_folder_is_all_its_trainings_and_no_other_group(tmp_path):
-    config = sweep_config(tmp_path, policies=["a", "straight"])
+@pytest.mark.parametrize(("names", "groups"), NAMED)
+def test_pretrained_policies_stand_by_their_groups_and_training_seeds_each_once(tmp_path, names, groups):
+    config = sweep_config(tmp_path, policies=names)
     for place, group, seed in (("a-s1", "a", 1), ("a-set-s0", "a-set", 0), ("a-s0", "a", 0)):
         save_training(tmp_path / "pretrained" / place, group, seed, config.env)
     policies = find_study_policies(config, open_run(config), tmp_path / "pretrained")
-    assert [(policy.group, policy.training) for policy in policies] == [
-        ("a", 0),
-        ("a", 1),
-        ("straight", None),
-    ]
+    named = [(group, seed) for group, seeds in groups.items() for seed in seeds]
+    assert [(policy.group, policy.training) for policy in policies] == named
+    assert plan_study(config, policies).groups == groups
 
 
 def test_policies_that_are_not_there_are_refused_with_the_remedy(tmp_path):
     folder = open_run(sweep_config(tmp_path))
-
-    def refusal(*names):
-        with pytest.raises(ConfigError) as refused:
+    kinds = ("event_columns", "event_image")
+    one, two = (save_training(tmp_path / name, "a", 0, EnvConfig(), name) for name in kinds)
+    damaged = save_training(tmp_path / "damaged", "b", 0, EnvConfig())
+    (tmp_path / "damaged" / MANIFEST).write_text("{}")
+    train = r"'pretrained' means the policies in .* train one \(python -m platform.launch \+exp=bytestream\)"
+    for names, rule in {
+        ("pretrained",): rf"^study\.policies: {train} .* study\.policies=\[newest\]$",
+        (str(tmp_path),): rf"^study\.policies: must be 'pretrained', 'newest', .*got '{tmp_path}'$",
+        (one, two): "^study.policies: two policies are a with training seed 0, got ",
+        (damaged,): r"lacks \['name', 'seed', 'sensor'\]; train it again",
+    }.items():
+        with pytest.raises(ConfigError, match=rule):
             find_study_policies(sweep_config(tmp_path, policies=names), folder, tmp_path / "none")
-        return str(refused.value)
-
-    assert refusal("pretrained").startswith("study.policies: 'pretrained' means the policies in ")
-    assert "train one (python -m platform.launch +exp=bytestream)" in refusal("pretrained")
-    assert refusal("pretrained").endswith("study.policies=[newest]")
-    assert refusal(str(tmp_path)).startswith("study.policies: must be 'pretrained', 'newest', ")
-    assert refusal(str(tmp_path)).endswith(f"got {str(tmp_path)!r}")
-    one, two = (save_training(tmp_path / name, "a", 0, EnvConfig(), kind) for name, kind in (
-        ("one", "event_columns"), ("two", "event_image")
-    ))  # fmt: skip
-    assert refusal(one, two).startswith("study.policies: two policies are a with training seed 0, got ")
-    (tmp_path / "one" / MANIFEST).write_text("{}")
-    assert "lacks ['name', 'seed', 'sensor']; train it again" in refusal(one)
-
-
-@pytest.mark.parametrize(
-    ("value", "label"),
-    [(45, "45"), (0.05, "0.05"), (0.12345678, "0.12345678"), ("frame", "frame"), (None, "null")],
-)
-def test_a_value_is_told_from_every_other_by_its_label(value, label):
-    assert text_of(value) == label
-
-
-def test_a_policy_whose_manifest_names_no_conditions_met_the_scene_of_training_and_a_baseline_none():
-    old, baseline = read_policy(str(PRETRAINED / "bytestream-s0")), read_policy("straight")
-    assert "conditions" not in read_policy_manifest(PRETRAINED / "bytestream-s0" / MANIFEST)
-    nominal, trained_in = EnvConfig(scene="poles_eval"), EnvConfig(scene="poles")
-    assert was_met(old, nominal, trained_in)
-    assert not was_met(old, nominal, EnvConfig(scene="poles_dense"))
-    assert not was_met(baseline, nominal, trained_in)

@@ -22,29 +22,20 @@ def test_a_group_pools_its_trainings():
     assert (row.trainings, row.episodes, row.success.value) == ((0, 1), 40, 0.6)
     low, high = row.success.interval
     assert low < 0.446 < 0.737 < high  # wider than Wilson's of 40 episodes
-    assert row.distance_m.value == pytest.approx(
-        np.mean([flights(10)["distance_m"], flights(14)["distance_m"]])
-    )
+    distances = [flights(won)["distance_m"] for won in (10, 14)]
+    assert row.distance_m.value == pytest.approx(np.mean(distances))
 
 
 def test_a_difference_is_taken_corridor_by_corridor():
     ours = {seed: flights(10, offset_m=3.0) for seed in (0, 1)}
     row = summarise(AT, "a", ours, {5: flights(10), 6: flights(10)})
-    assert row.success_difference.value == 0.0
-    assert row.success_difference.interval[0] < 0.0 < row.success_difference.interval[1]
-    assert row.distance_difference_m.value == pytest.approx(3.0)
-    low, high = row.distance_difference_m.interval
-    assert low < 3.0 < high  # of trainings that agree, too, there are few
-    worse = summarise(AT, "a", {0: flights(4)}, {0: flights(16)})
-    assert worse.success_difference.value == pytest.approx(-0.6)
-    assert worse.success_difference.interval[1] < 0
-
-
-def test_trainings_of_different_corridors_are_refused():
-    other = flights(3)
-    other["seed"] += 1
-    with pytest.raises(ValueError, match=r"trainings \[0, 1\] .*same corridors"):
-        summarise(AT, "a", {0: flights(3), 1: other})
+    for found, value in ((row.success_difference, 0.0), (row.distance_difference_m, 3.0)):
+        assert found.value == pytest.approx(value)
+        low, high = found.interval
+        assert low < value < high  # of trainings that agree, too, there are few
+    worse = summarise(AT, "a", {0: flights(4)}, {0: flights(16)}).success_difference
+    assert worse.value == pytest.approx(-0.6)
+    assert worse.interval[1] < 0
 
 
 def test_the_table_has_a_column_for_each_group_and_says_what_failed():
@@ -59,21 +50,15 @@ def test_the_table_has_a_column_for_each_group_and_says_what_failed():
     ]
 
 
-def test_every_estimate_stands_beside_its_interval():
+def test_a_row_stands_in_the_details_and_the_tracker_with_its_intervals_and_its_place_on_the_axis():
     row = summarise(AT, "a", {0: flights(10)}, {0: flights(10, offset_m=1.0)})
-    text = details_table([row], "b")
+    text, figures = details_table([row], "b"), check_metrics(metrics_of(row))
     low, high = row.distance_m.interval
     assert f"| {row.distance_m.value:.1f} [{low:.1f}, {high:.1f}] |" in text
     low, high = row.distance_difference_m.interval
     assert f"| -1.0 [{low:.1f}, {high:+.1f}] | 300 | 0 |" in text
-
-
-def test_a_tracked_row_says_its_place_on_the_axis_where_that_is_a_number():
-    row = summarise(AT, "a", {0: flights(10)}, {0: flights(8)})
-    figures = check_metrics(metrics_of(row))
-    assert figures["sweep/value"] == 0.2
+    assert (figures["sweep/value"], figures["sweep/success_difference"]) == (0.2, 0.0)
     assert figures["eval/success_rate_low"] == row.success.interval[0]
-    assert figures["sweep/success_difference"] == pytest.approx(0.1)
     word = dataclasses.replace(row, condition=("world", "poles"), success_difference=None)
     assert not {"sweep/value", "sweep/success_difference"} & set(metrics_of(word))
     single = summarise(AT, "a", {0: flights(1, trials=1)})
@@ -81,8 +66,7 @@ def test_a_tracked_row_says_its_place_on_the_axis_where_that_is_a_number():
 
 
 def test_the_first_column_of_a_tracked_table_is_unique():
-    rows = [summarise(AT, group, {0: flights(10)}) for group in ("a", "b")]
-    first, *others = columns_of(rows).values()
+    first, *others = columns_of([summarise(AT, group, {0: flights(10)}) for group in ("a", "b")]).values()
     assert len(set(first)) == 2
     assert {len(values) for values in others} == {2}
 
@@ -96,28 +80,23 @@ def test_the_first_column_of_a_tracked_table_is_unique():
     ],
 )
 def test_a_curve_has_the_axis_as_whole_steps_and_says_their_unit(numbers, steps, unit):
-    rows = [
-        summarise(("a", value), "g", {0: flights(won)}) for won, value in zip((5, 20), numbers, strict=True)
-    ]
+    low, high = numbers
+    rows = [summarise(("a", at), "g", {0: flights(won)}) for at, won in ((low, 5), (high, 20))]
     curves = axis_curves("a", numbers, rows)
     assert set(curves) == {f"sweep/a{unit}_success", f"sweep/a{unit}_distance_m"}
     assert curves[f"sweep/a{unit}_success"] == dict(zip(steps, [0.25, 1.0], strict=True))
-
-
-def test_an_axis_too_fine_for_whole_steps_has_no_curve():
-    assert axis_curves("a", [1e-5], []) == {}
+    assert axis_curves("a", [1e-5], []) == {}  # too fine for whole steps
 
 
 def test_an_axis_is_as_good_as_the_mean_of_its_conditions():
     """Against the published table of trainings, which another function wrote."""
-    text = part(published(DATA, "robustness", "robustness"), "axes")
+    text = part(published(DATA, "encoder_seeds", "encoder_seeds"), "axes")
     head, _, *lines = [line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith("|")]
-    with (DATA / "robustness_trainings.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rates = {}
+    with (DATA / "encoder_seeds_trainings.csv").open() as file:
+        for row in csv.DictReader(file):
+            rates.setdefault((row["Axis"], row["Group"]), []).append(float(row["success_rate"]))
+    assert lines
     for axis, *cells in lines:
         for group, cell in zip(head[1:], cells, strict=True):
-            rates = [
-                float(row["success_rate"]) for row in rows if (row["Axis"], row["Group"]) == (axis, group)
-            ]
-            assert rates
-            assert abs(float(cell.split()[0]) - 100 * np.mean(rates)) < 0.51
+            assert abs(float(cell.split()[0]) - 100 * np.mean(rates[axis, group])) < 0.51

@@ -17,10 +17,9 @@ from jobs.training.ppo.algorithm import NOTICE, PPO
 from jobs.training.ppo.train import FIGURES, LOSSES
 from jobs.training.sampling.snapshots import FOLDER, generators, set_generators
 from jobs.training.train import METRICS, export_policy, read_metrics
-from models.kinds import KINDS
 from tests.support.configs import make_config
-from tests.support.policies import ALIKE, TRAINED
-from tests.support.runs import write_encoder, write_networks
+from tests.support.learners import MODULE, encoder_of, words_of
+from tests.support.runs import write_networks
 
 pytestmark = pytest.mark.system
 # Episodes of 40 steps in rounds of 32: at any time some are under way, and others have ended.
@@ -37,7 +36,7 @@ IMITATION = (
 PRIVILEGED = ("model=event_columns", "algo.critic=teacher", "algo.shaping=10")
 BEGUN = ("model=event_columns", "train.init=X", "train.value_warmup=700")  # eight iterations
 OWN = {
-    "finetuned": ["model.encoder=finetuned"],
+    "gru": ["model=event_columns_gru", "model.own_actions=true", "model.own_velocity=true"],
     "imitation": IMITATION,
     "privileged": PRIVILEGED,
     "begun": BEGUN,
@@ -57,15 +56,16 @@ def a_ray(tmp_path_factory):
 
 def built(folder, name, *words):
     """The configuration of a small training, its encoder file, and a function that makes it."""
-    config = make_config(*OWN.get(name, [f"model={name}"]), *SMALL, *words)
-    encoder = write_encoder(folder, config) if KINDS[config.model.name].encoder else None
+    config = make_config(*OWN.get(name, words_of(name)), *SMALL, *words)
+    encoder = encoder_of(config, folder)
     init = write_networks(folder / "init", config) if config.train.init else None
     return config, encoder, lambda: PPO(config=build_algorithm(config, encoder, init))
 
 
 def rows(algorithm, iterations):
-    """What the next iterations report, but for the time that they took."""
+    """What the next undisturbed iterations report, but for the time that they took."""
     results = [{**algorithm.train(), "trial_restarts": 0} for _ in range(iterations)]
+    assert not any(NOTICE in result for result in results)
     told = [read_metrics(result, 1.0, ROW) for result in results]
     return json.dumps([{name: row[name] for name in SAME} for row in told])
 
@@ -79,8 +79,8 @@ def saved(algorithm, folder):
 def learned(algorithm):
     """Weights, Adam's state and its step size, by name."""
     state = algorithm.learner_group.get_state()["learner"]
-    weights, optimiser = state["rl_module"]["default_policy"], state["optimizer"]
-    adam = optimiser["default_policy_default_optimizer"]["state"]
+    weights, optimiser = state["rl_module"][MODULE], state["optimizer"]
+    adam = optimiser[f"{MODULE}_default_optimizer"]["state"]
     moments = {f"{k}.{name}": value for k, part in adam["state"].items() for name, value in part.items()}
     return {**weights, **moments, "lr": np.array(adam["param_groups"][0]["lr"])}
 
@@ -93,12 +93,11 @@ def assert_same(mine, other):
 @pytest.mark.parametrize(
     ("name", "runners"),
     [
-        *(pytest.param(name, 0, marks=pytest.mark.slow if name in ALIKE else ()) for name in TRAINED),
-        pytest.param("finetuned", 1, marks=pytest.mark.slow),
-        pytest.param("bytestream", 2, marks=pytest.mark.slow),
-        pytest.param("imitation", 2, marks=pytest.mark.slow),
-        ("begun", 0),
-        pytest.param("privileged", 2, marks=pytest.mark.slow),
+        *(("bytestream", 0), ("gru", 0), ("rgb", 0), ("begun", 0), ("imitation", 0)),
+        *(
+            pytest.param(name, count, marks=pytest.mark.slow)
+            for name, count in (("finetuned", 1), ("bytestream", 2), ("imitation", 2), ("privileged", 2))
+        ),
     ],
 )
 def test_a_training_goes_on_from_its_checkpoint_with_the_same_bytes(name, runners, tmp_path):
@@ -125,52 +124,43 @@ def test_a_training_goes_on_from_its_checkpoint_with_the_same_bytes(name, runner
     assert any(np.any(value) for path in files[0] for value in load_file(path).values())
 
 
-def test_a_training_that_is_never_saved_has_the_same_bytes(tmp_path):
-    _, _, make = built(tmp_path, "event_columns")
-    with torch_threads(3):  # the learner takes one, whatever the process has, and gives them back
-        one, other = make(), None
-        told = rows(one, 3)
-        one.stop()
-        assert torch.get_num_threads() == 3
-        other = make()
-        pieces = []
-        for k in range(3):
-            pieces += json.loads(rows(other, 1))
-            saved(other, tmp_path / str(k))
-    assert json.dumps(pieces) == told
-    assert_same(one, other)
-    other.stop()
-
-
-def test_the_first_part_of_a_longer_training_is_a_shorter_one(tmp_path):
-    (_, _, shorter), (_, _, longer) = (
-        built(tmp_path, "event_columns", "algo.lr_schedule=constant", f"train.env_steps={steps}")
+def test_the_first_part_of_a_longer_training_is_a_shorter_one_however_often_it_is_saved(tmp_path):
+    shorter, longer = (
+        built(tmp_path, "event_columns", "algo.lr_schedule=constant", f"train.env_steps={steps}")[2]
         for steps in (192, 384)
     )
-    whole = longer()
-    told = [rows(whole, 2), rows(whole, 2)]
-    part = shorter()
-    assert rows(part, 2) == told[0]
-    checkpoint = saved(part, tmp_path / "checkpoint")  # another training in this process seeds it anew
-    extended = longer()
+    with torch_threads(3):  # the learner takes one, whatever the process has, and gives them back
+        whole = longer()
+        told = [rows(whole, 1), rows(whole, 1), rows(whole, 2)]
+        assert torch.get_num_threads() == 3
+        part = shorter()
+        for number in range(2):
+            assert rows(part, 1) == told[number]
+            checkpoint = saved(part, tmp_path / str(number))
+    extended = longer()  # another training in this process seeds it anew
     extended.load_checkpoint(str(checkpoint))
-    assert rows(extended, 2) == told[1]
+    assert rows(extended, 2) == told[2]
+    assert_same(whole, extended)
     for algorithm in (whole, part, extended):
         algorithm.stop()
 
 
-@pytest.fixture
-def checkpoint(tmp_path):
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory):
     """A checkpoint of a training of two iterations, and what makes the training."""
-    _, _, make = built(tmp_path, "event_columns")
+    folder = tmp_path_factory.mktemp("kept")
+    _, _, make = built(folder, "event_columns")
     algorithm = make()
     rows(algorithm, 2)
-    yield saved(algorithm, tmp_path / "checkpoint"), make
+    yield saved(algorithm, folder / "checkpoint"), make
     algorithm.stop()
 
 
-def next_result(checkpoint, make):
-    algorithm = make()
+def next_result(kept, folder, harm):
+    """What the training reports next that goes on from a copy of the checkpoint, after some harm to it."""
+    checkpoint = shutil.copytree(kept[0], folder / "checkpoint")
+    harm(checkpoint / FOLDER)
+    algorithm = kept[1]()
     algorithm.load_checkpoint(str(checkpoint))
     try:
         return algorithm.train()
@@ -178,55 +168,51 @@ def next_result(checkpoint, make):
         algorithm.stop()
 
 
-def test_a_checkpoint_of_an_earlier_version_begins_new_episodes_and_says_so(checkpoint):
-    shutil.rmtree(checkpoint[0] / FOLDER)
-    result = next_result(*checkpoint)
-    assert "new episodes" in result[NOTICE]
-    assert "earlier version" in result[NOTICE]
-    assert result["num_env_steps_sampled_lifetime"] == 3 * 96
-
-
-def test_a_checkpoint_of_another_layout_is_refused_with_the_remedy(checkpoint):
-    about = checkpoint[0] / FOLDER / "layout.json"
+def of_another_layout(snapshots):
+    about = snapshots / "layout.json"
     write_json(about, read_json(about) | {"layout": 2})
-    with pytest.raises(
-        RunError, match="layout must be 1, got 2; continue with the version that wrote it, or"
-    ):
-        next_result(*checkpoint)
 
 
-def test_a_checkpoint_of_other_processes_is_refused(checkpoint):
-    about = checkpoint[0] / FOLDER / "layout.json"
-    values = json.loads(json.dumps(read_json(about)).replace('"0"', '"learner"'))
-    write_json(about, values)
-    with pytest.raises(RunError, match=r"must be of the processes \['0', 'learner'\], got \['learner'\]"):
-        next_result(*checkpoint)
-
-
-def changed(checkpoint, **arrays):
-    file = checkpoint / FOLDER / "0.npz"
-    with np.load(file) as before:
-        after = {**before, **{name: change(before[name]) for name, change in arrays.items()}}
-    np.savez(file, **after)
+def of_other_processes(snapshots):
+    about = snapshots / "layout.json"
+    write_json(about, json.loads(json.dumps(read_json(about)).replace('"0"', '"learner"')))
 
 
 @pytest.mark.parametrize(
-    ("arrays", "reason"),
+    ("harm", "words"),
     [
-        ({"stacks": lambda stacks: stacks + 1}, "the simulation shows something else than before"),
-        ({"episode_seed": lambda seeds: seeds + 1}, "the simulation shows something else than before"),
-        ({"actions_taken": lambda taken: np.array([taken.sum(), 0, 0])}, "actions must not outlast"),
+        (of_another_layout, "layout must be 1, got 2; continue with the version that wrote it, or"),
+        (of_other_processes, r"must be of the processes \['0', 'learner'\], got \['learner'\]"),
     ],
 )
-def test_a_simulation_that_does_not_repeat_itself_begins_new_episodes_and_says_so(checkpoint, arrays, reason):
-    changed(checkpoint[0], **arrays)
-    result = next_result(*checkpoint)
+def test_a_checkpoint_that_does_not_fit_is_refused(kept, tmp_path, harm, words):
+    with pytest.raises(RunError, match=words):
+        next_result(kept, tmp_path, harm)
+
+
+def changed(**arrays):
+    def harm(snapshots):
+        with np.load(snapshots / "0.npz") as before:
+            after = {**before, **{name: change(before[name]) for name, change in arrays.items()}}
+        np.savez(snapshots / "0.npz", **after)
+
+    return harm
+
+
+@pytest.mark.parametrize(
+    ("harm", "reason"),
+    [
+        (shutil.rmtree, "the checkpoint is of an earlier version"),
+        (changed(episode_seed=lambda seeds: seeds + 1), "the simulation shows something else than before"),
+        (changed(actions_taken=lambda taken: np.array([taken.sum(), 0, 0])), "actions must not outlast"),
+    ],
+)
+def test_what_cannot_be_repeated_begins_with_new_episodes_and_says_so(kept, tmp_path, harm, reason):
+    result = next_result(kept, tmp_path, harm)
+    assert "new episodes" in result[NOTICE]
     assert reason in result[NOTICE]
     assert result["env_runners"]["num_env_steps_sampled"] == 96
-
-
-def test_an_undisturbed_training_has_no_notice(checkpoint):
-    assert NOTICE not in next_result(*checkpoint)
+    assert result["num_env_steps_sampled_lifetime"] == 3 * 96
 
 
 def test_generators_go_on():

@@ -19,13 +19,12 @@ from jobs.training.ppo.learner import VALUE_WARMUP, PlainPPOLearner
 from jobs.training.sampling.env_runner import PlainEnvRunner
 from models.policy.event_set import EventSet
 from tests.support.configs import SHORT, make_config
+from tests.support.learners import MODULE, learn, moved, weights
 
 pytestmark = pytest.mark.system  # they build RLlib's algorithm many times
 
-MODULE = "default_policy"
-CUDA = pytest.param(
-    "cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no GPU here")
-)
+ON_GPU = pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no GPU here")
+on_devices = pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=ON_GPU)])
 
 
 @pytest.fixture(scope="module", params=["event_image", "event_set"])
@@ -53,27 +52,21 @@ def steps_on(learner, device):
     return GpuSteps(module, learner.get_optimizer(MODULE), learner._loss, device)
 
 
-def weights(learner):
-    return {name: value.clone() for name, value in learner.module[MODULE].state_dict().items()}
+def pair(ppo, env, monkeypatch, device, **training):
+    """Two learners with the same weights; the second takes its steps on a device."""
+    plain, other = (make_learner(ppo, env, monkeypatch, "cpu", **training) for _ in range(2))
+    other.set_state(plain.get_state())
+    other._gpu = steps_on(other, device)
+    assert plain._gpu is None
+    return plain, other
 
 
-def reduced(result):
-    return {
-        name: float(value.peek() if hasattr(value, "peek") else value)
-        for name, value in result[MODULE].items()
-        if name in ppo_learner.FIGURES or name == "vf_explained_var"
-    }
-
-
-@pytest.mark.parametrize("device", ["cpu", CUDA])
+@on_devices
 def test_steps_on_a_device_are_those_of_the_processor(ppo, flights, monkeypatch, device):
     """Rows that grow, and shrink below a minibatch; a minibatch that is not whole; a restored optimiser."""
     env, samples = flights
     monkeypatch.setattr(gpu_steps, "ROOM", 8)
-    plain, other = (make_learner(ppo, env, monkeypatch, "cpu") for _ in range(2))
-    other.set_state(plain.get_state())
-    other._gpu = steps_on(other, device)
-    assert plain._gpu is None
+    plain, other = pair(ppo, env, monkeypatch, device)
     first = weights(plain)
     taken = samples[0], samples[1] + samples[2], samples[2][:1], samples[1]
     assert len({sum(map(len, episodes)) for episodes in taken}) > 2
@@ -81,9 +74,8 @@ def test_steps_on_a_device_are_those_of_the_processor(ppo, flights, monkeypatch,
         told = []
         for learner in (plain, other):
             torch.manual_seed(k)
-            told.append(
-                reduced(learner.update(episodes=copy.deepcopy(episodes), num_epochs=2, minibatch_size=12))
-            )
+            figures = learn(learner, episodes, num_epochs=2, minibatch_size=12)
+            told.append([figures[name] for name in (*ppo_learner.FIGURES, "vf_explained_var")])
         assert told[1] == pytest.approx(told[0], rel=1e-3, abs=1e-5)
         if k == 2:
             other.set_state(copy.deepcopy(plain.get_state()))
@@ -99,95 +91,81 @@ def test_steps_on_a_device_are_those_of_the_processor(ppo, flights, monkeypatch,
 def assert_moved_alike(first, expected, found):
     """Single weights may differ: Adam moves one by a whole step whose gradient is all but zero."""
     for name, value in expected.items():
-        moved, apart = (float((value - one[name]).norm()) for one in (first, found))
-        assert moved > 1e-4, name
-        assert apart < 0.02 * moved, name
+        far, apart = (float((value - one[name]).norm()) for one in (first, found))
+        assert far > 1e-4, name
+        assert apart < 0.02 * far, name
 
 
-@pytest.mark.parametrize("device", ["cpu", CUDA])
+@on_devices
 def test_a_value_network_that_learns_alone_at_first_is_followed_by_the_policy(
     ppo, flights, monkeypatch, device
 ):
     env, (episodes, *_) = flights
     settings = {**ppo.learner_config_dict, VALUE_WARMUP: 100}
-    plain, other = (
-        make_learner(ppo, env, monkeypatch, "cpu", learner_config_dict=settings) for _ in range(2)
-    )
-    other.set_state(plain.get_state())
-    other._gpu = steps_on(other, device)
+    plain, other = pair(ppo, env, monkeypatch, device, learner_config_dict=settings)
     for sampled in (64, 200):
         first = weights(plain)
         for learner in (plain, other):
             torch.manual_seed(sampled)
-            timesteps = {"num_env_steps_sampled_lifetime": sampled}
-            flown = copy.deepcopy(episodes)
-            learner.update(episodes=flown, timesteps=timesteps, num_epochs=2, minibatch_size=16)
-        still = {name for name, value in weights(other).items() if torch.equal(value, first[name])}
-        assert still == ({name for name in first if not name.startswith("vf.")} if sampled == 64 else set())
+            learn(learner, episodes, sampled, num_epochs=2, minibatch_size=16)
+        learning = {name for name in first if sampled == 200 or name.startswith("vf.")}
+        assert moved(first, other) == learning
         apart = [float((value - weights(other)[name]).abs().max()) for name, value in weights(plain).items()]
         assert max(apart) < 1e-3
 
 
-@pytest.mark.parametrize("device", ["cpu", CUDA])
+@on_devices
 def test_another_step_size_and_another_entropy_are_taken_from_then_on(ppo, flights, monkeypatch, device):
     env, (episodes, *_) = flights
     learner = make_learner(ppo, env, monkeypatch, "cpu", lr=0.0)
     learner._gpu = steps_on(learner, device)
     first = weights(learner)
-    asked = {"num_epochs": 1, "minibatch_size": 16}
-    learner.update(episodes=copy.deepcopy(episodes), **asked)
-    assert all(torch.equal(first[name], value) for name, value in weights(learner).items())
+    learn(learner, episodes, minibatch_size=16)
+    assert not moved(first, learner)
     learner.get_optimizer(MODULE).param_groups[0]["lr"] = 1e-3
-    learner.update(episodes=copy.deepcopy(episodes), **asked)
-    assert any(not torch.equal(first[name], value) for name, value in weights(learner).items())
+    learn(learner, episodes, minibatch_size=16)
+    assert moved(first, learner)
     for coefficient in (0.0, 3.0):
         monkeypatch.setattr(PlainPPOLearner, "_entropy_coeff", coefficient)
-        told = reduced(learner.update(episodes=copy.deepcopy(episodes), **asked))
+        told = learn(learner, episodes, minibatch_size=16)
         parts = told["policy_loss"] + 0.5 * told["vf_loss"] - coefficient * told["entropy"]
         assert told["total_loss"] == pytest.approx(parts, abs=1e-3)
 
 
-@pytest.mark.parametrize("device", ["cpu", CUDA])
+@on_devices
 def test_a_gradient_that_is_not_finite_leaves_everything_as_it_was(ppo, flights, monkeypatch, device):
     env, (episodes, *_) = flights
     learner = make_learner(ppo, env, monkeypatch, "cpu")
     learner._gpu = steps_on(learner, device)
-    learner.update(episodes=copy.deepcopy(episodes), num_epochs=1, minibatch_size=16)
+    learn(learner, episodes, minibatch_size=16)
     first, state = weights(learner), copy.deepcopy(learner.get_optimizer(MODULE).state_dict())
     broken = copy.deepcopy(episodes)
     for episode in broken:
         episode.set_rewards(new_data=math.inf * abs(episode.get_rewards()))
     with pytest.raises(RuntimeError, match="gradients must be finite"):
-        learner.update(episodes=broken, num_epochs=1, minibatch_size=16)
-    assert all(torch.equal(first[name], value) for name, value in weights(learner).items())
+        learn(learner, broken, minibatch_size=16)
+    assert not moved(first, learner)
     for name, one in learner.get_optimizer(MODULE).state_dict()["state"].items():
         assert all(torch.equal(value, state["state"][name][key]) for key, value in one.items())
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no GPU here")
+@ON_GPU
 def test_a_gpu_gives_the_same_digits_again(ppo, flights, monkeypatch):
     env, samples = flights
-    found = []
-    for _ in range(2):
-        learner = make_learner(ppo, env, monkeypatch, "cuda")
+    learners = [make_learner(ppo, env, monkeypatch, "cuda") for _ in range(2)]
+    for learner in learners:
         assert learner._gpu is not None
         for k, episodes in enumerate(samples):
             torch.manual_seed(k)
-            learner.update(episodes=copy.deepcopy(episodes), num_epochs=2, minibatch_size=12)
-        found.append(weights(learner))
-    assert all(torch.equal(value, found[1][name]) for name, value in found[0].items())
+            learn(learner, episodes, num_epochs=2, minibatch_size=12)
+    assert not moved(weights(learners[0]), learners[1])
 
 
-def test_networks_over_pictures_and_sets_of_events_go_to_the_device(ppo, flights, monkeypatch):
+def test_networks_over_pictures_and_sets_go_to_the_device_and_dense_ones_stay(ppo, flights, monkeypatch):
     monkeypatch.setattr(ppo_learner, "GpuSteps", lambda *told: told)
     assert make_learner(ppo, flights[0], monkeypatch, "cuda")._gpu[-1] == "cuda"
-
-
-def test_dense_networks_stay_with_the_processor(monkeypatch):
     dense = build_algorithm(make_config(*SHORT, "model=event_columns"))
-    runner = PlainEnvRunner(config=dense, worker_index=0)
-    assert make_learner(dense, runner.env, monkeypatch, "cuda")._gpu is None
-    runner.stop()
+    assert make_learner(dense, flights[0], monkeypatch, "cuda")._gpu is None
 
 
 def test_what_a_gpu_computes_of_sets_makes_no_tensor_of_numbers(monkeypatch):
@@ -206,7 +184,6 @@ def test_a_gpu_that_is_not_there_is_refused(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(ConfigError, match=r"cluster\.device"):
         check_inputs(make_config("cluster.device=cuda"))
-    check_inputs(make_config())
     with pytest.raises(ConfigError, match="device"):
         make_config("cluster=ray", "cluster.device=cuda")
 

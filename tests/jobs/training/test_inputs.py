@@ -25,45 +25,36 @@ SIZES["finetuned"] = (*SIZES["bytestream"], "model.encoder=finetuned")
 ENCODERS = {"event_columns": set(), "finetuned": set(), "bytestream": {"encoder.json", "encoder.safetensors"}}
 
 
-class Tracker:
-    """Remembers the tags of a run that began from the policy of another."""
-
-    run_id = "mine"
-
-    def __init__(self):
-        self.told = {}
-
-    def of(self, path):
-        return SimpleNamespace(run_id=f"that of {path.name}")
-
-    def tags(self, values):
-        self.told |= values
+def tracker(told=None):
+    """Writes down the tags of a run that began from the policy of another."""
+    other = lambda path: SimpleNamespace(run_id=f"that of {path.name}")  # noqa: E731
+    return SimpleNamespace(run_id="mine", of=other, tags=({} if told is None else told).update)
 
 
-def begun(tmp_path, name, *words):
+def begun(tmp_path, name):
     """The configuration of a training that begins from a policy of a kind."""
-    own = *SHORT, f"runs_dir={tmp_path / 'runs'}", "algo.num_env_runners=0", *SIZES[name], *words
+    own = *SHORT, f"runs_dir={tmp_path / 'runs'}", "algo.num_env_runners=0", *SIZES[name]
     save_untrained(tmp_path / "before" / "policy", make_config(*own).env, name)
     return make_config(*own, f"train.init={tmp_path / 'before'}")
 
 
 @pytest.mark.parametrize("name", kinds(SIZES, quick=("event_columns",)))
 def test_a_run_keeps_a_copy_of_the_policy_that_it_begins_from(tmp_path, name):
-    config, tracker = begun(tmp_path, name), Tracker()
+    config, told = begun(tmp_path, name), {}
     check_inputs(config)
     folder, source = open_run(config), tmp_path / "before" / "policy"
-    found = prepare_inputs(folder, tracker)
+    found = prepare_inputs(folder, tracker(told))
     assert found == (folder.init / "encoder.safetensors" if name == "bytestream" else None)
     expected = load_policy(source).manifest["sha256"]["networks.safetensors"]
-    assert tracker.told == {"init": source, "init_sha256": expected, "init_run": "that of before"}
+    assert told == {"init": source, "init_sha256": expected, "init_run": "that of before"}
     names = {path.name for path in folder.init.iterdir()}
     assert names == {"policy.json", "networks.safetensors"} | ENCODERS[name]
     assert all((folder.init / own).read_bytes() == (source / own).read_bytes() for own in names)
     shutil.rmtree(source.parent)
     check_inputs(config)
-    again = Tracker()
-    assert prepare_inputs(folder, again) == found
-    assert again.told == {}
+    told.clear()
+    assert prepare_inputs(folder, tracker(told)) == found
+    assert told == {}
     networks = load_policy(folder.init).networks.state_dict()
     ppo = build_algorithm(config, found, folder.init / "networks.safetensors")
     module = ppo.rl_module_spec.build()
@@ -76,7 +67,7 @@ def test_a_run_keeps_a_copy_of_the_policy_that_it_begins_from(tmp_path, name):
 def test_a_shipped_policy_can_be_trained_on(tmp_path):
     config = make_config(f"runs_dir={tmp_path}", "train.init=models/pretrained/bytestream-s0")
     check_inputs(config)
-    path = prepare_inputs(locate_run(config), Tracker())
+    path = prepare_inputs(locate_run(config), tracker())
     module = build_algorithm(config, path, path.parent / "networks.safetensors").rl_module_spec.build()
     expected = load_policy("models/pretrained/bytestream-s0").networks
     assert torch.equal(module.pi[0].weight, expected["pi"][0].weight)
@@ -90,9 +81,6 @@ COLUMNS = "model=event_columns model.hidden=[16]"
     [
         (f"{COLUMNS} train.init=nowhere", "must be a run folder or a policy folder, got 'nowhere'"),
         (f"{COLUMNS} model.stack=2", "must be a policy of the same model, got stack: 3 there, 2 here; set "),
-        ("model=event_columns", r"got hidden: \[16\] there, \[64, 64\] here;"),
-        (f"{COLUMNS} model.memory_ms=[20]", r"got memory_ms: \[\] there, \[20.0\] here;"),
-        ("model=event_set", "got name: 'event_columns' there, 'event_set' here, hidden"),
         (f"{COLUMNS} camera.contrast_threshold=0.3", "the policy's, got contrast_threshold = 0.3 instead of"),
     ],
 )

@@ -13,16 +13,15 @@ from jobs.training.ppo.learner import PlainPPOLearner
 from jobs.training.ppo.losses import advantages
 from jobs.training.sampling.env_runner import PlainEnvRunner
 from tests.support.configs import SHORT, make_config
-from tests.support.runs import write_encoder
+from tests.support.learners import MODULE, learn, module_of, moved, weights
 
 FIGURES = ("policy_loss", "vf_loss", "entropy", "total_loss", "vf_explained_var")
 NORM = "gradients_default_optimizer_global_norm"
 
 
 @pytest.fixture(scope="module")
-def ppo(tmp_path_factory):
-    config = make_config(*SHORT, "algo.entropy_coeff=0.03")
-    return build_algorithm(config, write_encoder(tmp_path_factory.mktemp("encoder"), config))
+def ppo(encoder):
+    return build_algorithm(make_config(*SHORT, "algo.entropy_coeff=0.03"), encoder)
 
 
 @pytest.fixture(scope="module")
@@ -34,19 +33,9 @@ def flights(ppo):
     runner.stop()
 
 
-def make_learner(ppo, env, learner_class, **training):
-    return (
-        ppo.copy(copy_frozen=False).training(learner_class=learner_class, **training).build_learner(env=env)
-    )
-
-
-def weights(learner):
-    return {name: value.clone() for name, value in learner.module["default_policy"].state_dict().items()}
-
-
-def reduced(results, name):
-    value = results["default_policy"][name]
-    return float(value.peek() if hasattr(value, "peek") else value)
+def make_learner(ppo, env, learner_class=PlainPPOLearner, **training):
+    made = ppo.copy(copy_frozen=False).training(learner_class=learner_class, **training)
+    return made.build_learner(env=env)
 
 
 def scaled(episodes, factor):
@@ -64,7 +53,7 @@ def tensor_by_tensor(monkeypatch):
 
 @pytest.mark.system
 @pytest.mark.parametrize("compiled", [True, False])
-@pytest.mark.parametrize("training", [{}, {"grad_clip": 1e-3}, {"clip_param": 0.01}, {"vf_clip_param": 0.5}])
+@pytest.mark.parametrize("training", [{}, {"grad_clip": 1e-3, "clip_param": 0.01, "vf_clip_param": 0.5}])
 def test_an_update_is_rllibs_own(ppo, flights, training, compiled, monkeypatch):
     env, samples = flights
     if not compiled:
@@ -94,18 +83,15 @@ def test_an_update_is_rllibs_own(ppo, flights, training, compiled, monkeypatch):
     monkeypatch.setattr(theirs, "_make_batch_if_necessary", keep_batch)
     monkeypatch.setattr(PlainPPOLearner, "_rows", with_rllibs_advantages)
     for episodes in samples:
-        results = [
-            theirs.update(episodes=scaled(episodes, 0.5), num_epochs=1),
-            ours.update(episodes=copy.deepcopy(episodes), num_epochs=1),
-        ]
+        expected = learn(theirs, scaled(episodes, 0.5))
+        found = learn(ours, episodes)
         for name in (NORM, *FIGURES[:4]):
-            expected, found = (reduced(result, name) for result in results)
-            assert found == pytest.approx(expected, rel=1e-4, abs=1e-6), name
+            assert found[name] == pytest.approx(expected[name], rel=1e-4, abs=1e-6), name
     expected, found = weights(theirs), weights(ours)
-    moved = max(float((expected[name] - first[name]).abs().max()) for name in first)
+    far = max(float((expected[name] - first[name]).abs().max()) for name in first)
     apart = max(float((expected[name] - found[name]).abs().max()) for name in first)
-    assert apart < 1e-3 * moved
-    assert moved > 1e-5
+    assert apart < 1e-3 * far
+    assert far > 1e-5
 
 
 @pytest.mark.parametrize("terminated", [True, False])
@@ -124,41 +110,10 @@ def test_advantages_are_those_of_a_plain_loop_and_of_rllib(terminated):
     np.testing.assert_allclose(found + values[:40], targets[:40], rtol=1e-5, atol=1e-5)
 
 
-def test_compiled_steps_are_those_of_tensors(ppo, flights, monkeypatch):
-    """Many small minibatches, the last of which is not whole, across updates and a restored optimiser."""
-    env, samples = flights
-    compiled, plain = (make_learner(ppo, env, PlainPPOLearner, entropy_coeff=0.1) for _ in range(2))
-    plain.set_state(compiled.get_state())
-    first = weights(compiled)
-    for k, episodes in enumerate(samples):
-        told = []
-        for learner in (compiled, plain) if k % 2 else (plain, compiled):
-            torch.manual_seed(k)
-            with monkeypatch.context() as patched:
-                if learner is plain:
-                    tensor_by_tensor(patched)
-                told.append(learner.update(episodes=copy.deepcopy(episodes), num_epochs=3, minibatch_size=10))
-        for name in (NORM, *FIGURES):
-            one, other = (reduced(result, name) for result in told)
-            assert one == pytest.approx(other, rel=1e-4, abs=1e-5), name
-        again = make_learner(ppo, env, PlainPPOLearner, entropy_coeff=0.1)
-        again.set_state(compiled.get_state())
-        compiled = again
-    moved = max(float((weights(plain)[name] - first[name]).abs().max()) for name in first)
-    for name, value in weights(compiled).items():
-        assert float((value - weights(plain)[name]).abs().max()) < 1e-4 * moved, name
-    adam, plain_adam = (
-        learner.get_optimizer("default_policy").state_dict()["state"] for learner in (compiled, plain)
-    )
-    for key, state in plain_adam.items():
-        for name, value in state.items():
-            torch.testing.assert_close(adam[key][name], value, rtol=1e-3, atol=1e-6)
-
-
 def test_every_step_is_seen_once_an_epoch_in_another_order(ppo, flights, monkeypatch):
     env, samples = flights
     tensor_by_tensor(monkeypatch)
-    learner = make_learner(ppo, env, PlainPPOLearner)
+    learner = make_learner(ppo, env)
     seen = []
     loss = learner._loss
 
@@ -167,7 +122,7 @@ def test_every_step_is_seen_once_an_epoch_in_another_order(ppo, flights, monkeyp
         return loss(module, rows)
 
     monkeypatch.setattr(learner, "_loss", seeing_loss)
-    learner.update(episodes=copy.deepcopy(samples[0]), num_epochs=3, minibatch_size=10)
+    learn(learner, samples[0], num_epochs=3, minibatch_size=10)
     assert [len(part) for part in seen] == [10, 10, 10, 10, 10, 10, 4] * 3
     epochs = [torch.cat(seen[7 * k : 7 * k + 7]) for k in range(3)]
     assert all(torch.equal(epoch.sort().values, epochs[0].sort().values) for epoch in epochs)
@@ -176,13 +131,13 @@ def test_every_step_is_seen_once_an_epoch_in_another_order(ppo, flights, monkeyp
 
 def test_explained_variance_is_one_for_values_on_target(ppo, flights, monkeypatch):
     env, samples = flights
-    learner = make_learner(ppo, env, PlainPPOLearner)
+    learner = make_learner(ppo, env)
     found = []
     explain = learner._explained_variance
     monkeypatch.setattr(learner, "_explained_variance", lambda rows: found.append(rows) or explain(rows))
-    learner.update(episodes=copy.deepcopy(samples[0]), num_epochs=1)
-    rows, module = found[0], learner.module["default_policy"].unwrapped()
-    values = module.compute_values(rows).detach()
+    learn(learner, samples[0])
+    rows = found[0]
+    values = module_of(learner).compute_values(rows).detach()
     assert explain({**rows, "value_targets": values}) == 1.0
     assert explain({**rows, "value_targets": values.flip(0)}) < 0.9
     assert explain({**rows, "value_targets": torch.linspace(-1e-3, 1e-3, len(values))}) == -1.0
@@ -190,29 +145,27 @@ def test_explained_variance_is_one_for_values_on_target(ppo, flights, monkeypatc
 
 def test_the_learning_rate_follows_its_schedule(ppo, flights):
     env, samples = flights
-    learner = make_learner(ppo, env, PlainPPOLearner, lr=[[0, 1e-3], [1000, 0.0]])
+    learner = make_learner(ppo, env, lr=[[0, 1e-3], [1000, 0.0]])
     for steps, expected in ((250, 7.5e-4), (1000, 0.0)):
-        timesteps = {"num_env_steps_sampled_lifetime": steps}
-        learner.update(episodes=copy.deepcopy(samples[0]), timesteps=timesteps, num_epochs=1)
-        rate = learner.get_optimizer("default_policy").param_groups[0]["lr"]
-        assert float(rate) == pytest.approx(expected)
+        learn(learner, samples[0], steps)
+        assert float(learner.get_optimizer(MODULE).param_groups[0]["lr"]) == pytest.approx(expected)
     before = weights(learner)
-    learner.update(episodes=copy.deepcopy(samples[0]), num_epochs=1)
-    assert all(torch.equal(value, before[name]) for name, value in weights(learner).items())
+    learn(learner, samples[0], 1000)
+    assert not moved(before, learner)
 
 
 def test_a_gradient_that_is_not_finite_stops_before_the_weights_move(ppo, flights, monkeypatch):
     env, samples = flights
-    learner = make_learner(ppo, env, PlainPPOLearner)
+    learner = make_learner(ppo, env)
     before, loss = weights(learner), learner._loss
     with monkeypatch.context() as broken:
         tensor_by_tensor(broken)
         broken.setattr(learner, "_loss", lambda *asked: (loss(*asked)[0] * math.nan, {}))
         with pytest.raises(RuntimeError, match="non-finite"):
-            learner.update(episodes=copy.deepcopy(samples[0]), num_epochs=1, minibatch_size=32)
+            learn(learner, samples[0], minibatch_size=32)
     with monkeypatch.context() as broken:
         broken.setattr(ppo_learner, "advantages", lambda values, rewards, *rest: np.nan * rewards)
         with pytest.raises(RuntimeError, match="non-finite"):
-            learner.update(episodes=copy.deepcopy(samples[0]), num_epochs=1, minibatch_size=32)
-    assert all(torch.equal(value, before[name]) for name, value in weights(learner).items())
-    assert np.isfinite(reduced(learner.update(episodes=samples[1], num_epochs=1), "total_loss"))
+            learn(learner, samples[0], minibatch_size=32)
+    assert not moved(before, learner)
+    assert np.isfinite(learn(learner, samples[1])["total_loss"])

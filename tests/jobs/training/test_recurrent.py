@@ -8,7 +8,6 @@ from ray.rllib.core.columns import Columns
 from ray.rllib.env.utils.infinite_lookback_buffer import InfiniteLookbackBuffer
 
 from jobs.training.algorithms import build_algorithm
-from jobs.training.imitation.env_runner import TaughtEnvRunner
 from jobs.training.imitation.labelled_steps import windows
 from jobs.training.imitation.learner import sequence_steps
 from jobs.training.ppo.learner import REWARD_SCALE, PlainPPOLearner, _minibatch
@@ -16,6 +15,7 @@ from jobs.training.ppo.losses import FIRST_ROW, STARTS, TAKEN, sequences
 from jobs.training.sampling.env_runner import STATES, PlainEnvRunner
 from models.policy.rllib_module import SEQUENCE, STATE
 from tests.support.configs import SHORT, make_config
+from tests.support.learners import learn, module_of, moved, weights
 
 OWN = "model.own_actions=true", "model.own_velocity=true"
 GRU = *SHORT, "model=event_columns_gru", "model.units=8", *OWN
@@ -27,7 +27,7 @@ def sampled():
     runner = PlainEnvRunner(config=ppo, worker_index=0)
     episodes = [runner.sample(num_timesteps=90) for _ in range(2)]
     learner = ppo.build_learner(env=runner.env)
-    learner.module["default_policy"].unwrapped().load_state_dict(runner.module.state_dict(), strict=False)
+    module_of(learner).load_state_dict(runner.module.state_dict(), strict=False)
     yield runner, learner, episodes
     runner.stop()
 
@@ -44,7 +44,7 @@ def test_rows_are_cut_into_sequences_that_end_with_their_piece_and_hold_each_row
 
 def test_the_states_of_an_episode_begin_at_zero_and_the_learner_repeats_the_decisions(sampled):
     _, learner, (first, _) = sampled
-    module = learner.module["default_policy"].unwrapped()
+    module = module_of(learner)
     for episode in first:
         states = episode.get_extra_model_outputs(STATES)
         if episode.t_started == 0:
@@ -62,7 +62,7 @@ def test_the_states_of_an_episode_begin_at_zero_and_the_learner_repeats_the_deci
 def test_the_gradient_of_a_minibatch_is_that_of_its_sequences_one_by_one(sampled):
     """And steps that only fill a sequence have no part in it."""
     _, learner, (first, _) = sampled
-    module = learner.module["default_policy"].unwrapped()
+    module = module_of(learner)
     parts = sequences(learner._rows(first), 16)
     counts = parts[TAKEN].sum(1).tolist()
     assert min(counts) < 16
@@ -83,13 +83,12 @@ def test_the_gradient_of_a_minibatch_is_that_of_its_sequences_one_by_one(sampled
     torch.testing.assert_close(whole, single, rtol=1e-3, atol=1e-6)
 
 
-def test_an_update_improves_the_loss_and_moves_every_weight(sampled):
+def test_an_update_moves_every_weight(sampled):
     _, learner, (_, second) = sampled
-    before = copy.deepcopy(learner.module["default_policy"].unwrapped().state_dict())
-    learner.update(episodes=copy.deepcopy(second), num_epochs=2, minibatch_size=64)
-    after = learner.module["default_policy"].unwrapped().state_dict()
+    before = weights(learner)
+    learn(learner, second, num_epochs=2, minibatch_size=64)
     assert isinstance(learner, PlainPPOLearner)
-    assert all(not torch.equal(before[name], after[name]) for name in before)
+    assert moved(before, learner) == before.keys()
 
 
 def for_rllib(episode, module, reward_scale):
@@ -112,30 +111,14 @@ def test_rllibs_learner_sees_the_same_sequences(sampled):
     theirs = own.training(learner_class=PPOTorchLearner).build_learner(env=runner.env)
     ours = own.training(learner_class=PlainPPOLearner).build_learner(env=runner.env)
     for one in (theirs, ours):
-        one.module["default_policy"].unwrapped().load_state_dict(runner.module.state_dict(), strict=False)
+        module_of(one).load_state_dict(runner.module.state_dict(), strict=False)
     ours.set_state(theirs.get_state())
-    module = theirs.module["default_policy"].unwrapped()
     begun = [episode for episode in first if episode.t_started == 0]
     scale = learner.config.learner_config_dict[REWARD_SCALE]
-    results = [
-        theirs.update(episodes=[for_rllib(episode, module, scale) for episode in begun], num_epochs=1),
-        ours.update(episodes=copy.deepcopy(begun), num_epochs=1),
-    ]
+    expected = learn(theirs, [for_rllib(episode, module_of(theirs), scale) for episode in begun])
+    found = learn(ours, begun)
     for name in ("entropy", "vf_loss"):
-        expected, found = (float(result["default_policy"][name].peek()) for result in results)
-        assert found == pytest.approx(expected, rel=1e-3), name
-
-
-def test_a_runner_resumes_with_the_states_of_its_episodes(sampled):
-    runner, _, _ = sampled
-    snapshot = copy.deepcopy(runner.snapshot())
-    expected = runner.sample(num_timesteps=40)
-    assert not runner.resume(snapshot)
-    again = runner.sample(num_timesteps=40)
-    for one, other in zip(expected, again, strict=True):
-        for name in (STATES, Columns.ACTION_DIST_INPUTS):
-            a, b = one.get_extra_model_outputs(name), other.get_extra_model_outputs(name)
-            np.testing.assert_array_equal(a, b)
+        assert found[name] == pytest.approx(expected[name], rel=1e-3), name
 
 
 def test_windows_hold_each_step_once_behind_what_leads_to_its_state():
@@ -151,11 +134,22 @@ def test_windows_hold_each_step_once_behind_what_leads_to_its_state():
     assert cut["number"][:, 0].tolist() == [0, 0, 2, 5, 7, 9, 12]
 
 
-def test_a_window_at_the_start_of_an_episode_repeats_the_decisions_of_the_env_runner():
+@pytest.fixture
+def taught(make_runner):
+    """A function that makes an env runner with a teacher, and the learner of its algorithm."""
+
+    def make(*words):
+        built = build_algorithm(make_config(*GRU, "algo=imitation", "algo.num_env_runners=0", *words))
+        runner = make_runner(built)
+        return runner, built.build_learner(env=runner.env)
+
+    return make
+
+
+def test_a_window_at_the_start_of_an_episode_repeats_the_decisions_of_the_env_runner(taught):
     runner, learner = taught()
-    episodes = runner.sample(num_timesteps=300)
-    rows = learner._rows(episodes)
-    module = learner.module["default_policy"].unwrapped()
+    rows = learner._rows(runner.sample(num_timesteps=150))
+    module = module_of(learner)
     module.load_state_dict(runner.module.state_dict(), strict=False)
     cut = windows(rows, SEQUENCE, SEQUENCE)
     state = torch.zeros(len(cut[TAKEN]), module.state_size)
@@ -163,41 +157,28 @@ def test_a_window_at_the_start_of_an_episode_repeats_the_decisions_of_the_env_ru
     with torch.no_grad():
         logits = module._forward_train(batch)[Columns.ACTION_DIST_INPUTS]
     expected = cut[Columns.ACTION_DIST_INPUTS]
-    assert cut[TAKEN].sum() > 200
+    assert cut[TAKEN].sum() > 100
     torch.testing.assert_close(logits[cut[TAKEN]], expected[cut[TAKEN]], rtol=1e-4, atol=1e-5)
-    runner.stop()
 
 
-def test_a_recurrent_policy_learns_what_a_teacher_says():
-    runner, learner = taught("algo.imitation.fit_steps=150", "algo.lr=3e-3", "algo.mirrored=true")
-    episodes = runner.sample(num_timesteps=600)
+def test_a_recurrent_policy_learns_what_a_teacher_says(taught):
+    runner, learner = taught("algo.imitation.fit_steps=80", "algo.lr=1e-2", "algo.mirrored=true")
+    episodes = runner.sample(num_timesteps=300)
     rows = windows(learner._rows(episodes), SEQUENCE, SEQUENCE)
-    module = learner.module["default_policy"].unwrapped()
-    before = float(learner._loss(module, rows)[0].detach())
-    learner.update(episodes=episodes, timesteps={"num_env_steps_sampled_lifetime": 1}, minibatch_size=256)
-    assert float(learner._loss(module, rows)[0].detach()) < 0.8 * before
+    before = float(learner._loss(module_of(learner), rows)[0].detach())
+    learn(learner, episodes, 1, minibatch_size=256)
+    assert float(learner._loss(module_of(learner), rows)[0].detach()) < 0.8 * before
     assert learner._steps.seen == 2 * len(rows[TAKEN])
-    runner.stop()
 
 
-def test_half_of_a_short_piece_leads_to_the_state_of_the_other_half():
+def test_half_of_a_short_piece_leads_to_the_state_of_the_other_half(taught):
     small = "algo.train_batch_size_per_learner=64", "algo.minibatch_size=16"  # of two environments
-    runner, learner = taught(*small, "env.time_limit_s=1.0")
+    runner, learner = taught(*small, "env.time_limit_s=1.0", "algo.imitation.fit_steps=2")
     assert sequence_steps(learner.config) == 16
     for _ in range(2):  # the second time no piece begins an episode, but where one has ended
         episodes = runner.sample(num_timesteps=64)
         cut = windows(learner._rows(episodes), 16, 16)
     assert cut[TAKEN].shape[1] == 32
     assert cut[TAKEN].sum() >= 0.4 * sum(map(len, episodes))
-    told = {"num_env_steps_sampled_lifetime": 1}
-    learner.update(episodes=episodes, timesteps=told, minibatch_size=16)
+    learn(learner, episodes, 1, minibatch_size=16)
     assert len(learner._steps) == len(cut[TAKEN])
-    runner.stop()
-
-
-def taught(*words):
-    few = "algo.num_env_runners=0", "train.env_steps=1000"
-    config = make_config(*GRU, "algo=imitation", *few, *words)
-    ppo = build_algorithm(config)
-    runner = TaughtEnvRunner(config=ppo, worker_index=0)
-    return runner, ppo.build_learner(env=runner.env)

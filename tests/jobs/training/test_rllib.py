@@ -6,10 +6,8 @@ from ray.rllib.algorithms.algorithm import Algorithm as RLlibAlgorithm
 from ray.rllib.core.rl_module.rl_module import RLModule
 
 from jobs.config.config import ConfigError, parse
-from jobs.run.folder import run_name
 from jobs.run.ray_cluster import start_ray
 from jobs.training.algorithms import algorithm_of, build_algorithm
-from jobs.training.policy import policy_spec
 from jobs.training.rllib.observed import ObservedCorridor
 from jobs.training.train import MODULE, export_policy, read_metrics
 from models.policy import load_policy
@@ -25,7 +23,7 @@ SMALL = (
 )
 
 
-@pytest.fixture(scope="module", autouse=True)
+@pytest.fixture(scope="module")
 def cluster(tmp_path_factory):
     start_ray(make_config().cluster, tmp_path_factory.mktemp("ray"))
     yield
@@ -33,7 +31,7 @@ def cluster(tmp_path_factory):
 
 
 @pytest.mark.system
-def test_a_users_dqn_trains_reports_and_is_exported_as_a_policy_that_acts_greedily(tmp_path):
+def test_a_users_dqn_trains_reports_and_is_exported_as_a_policy_that_acts_greedily(tmp_path, cluster):
     config = make_config(*SMALL)
     algorithm = algorithm_of(config)
     training = algorithm.trainable(config)(config=build_algorithm(config))
@@ -46,7 +44,7 @@ def test_a_users_dqn_trains_reports_and_is_exported_as_a_policy_that_acts_greedi
     training.save(str(tmp_path / "checkpoint"))
     export_policy(config, tmp_path / "checkpoint", None, tmp_path / "policy", {})
     module = RLModule.from_checkpoint(tmp_path / "checkpoint" / MODULE)
-    policy, env = load_policy(tmp_path / "policy"), ObservedCorridor(built_context(training))
+    policy, env = load_policy(tmp_path / "policy"), ObservedCorridor(training.config.env_config)
     seen, _ = env.reset(seed=3)
     for _ in range(20):
         with torch.no_grad():
@@ -59,12 +57,8 @@ def test_a_users_dqn_trains_reports_and_is_exported_as_a_policy_that_acts_greedi
     training.stop()
 
 
-def built_context(training):
-    return training.config.env_config
-
-
 @pytest.mark.slow
-def test_a_checkpoint_of_ppo_is_opened_by_rllibs_own_command(tmp_path):
+def test_a_checkpoint_of_ppo_is_opened_by_rllibs_own_command(tmp_path, cluster):
     config = make_config(*COLUMNS, "algo.train_batch_size_per_learner=64", "algo.num_envs_per_env_runner=2")
     training = algorithm_of(config).trainable(config)(config=build_algorithm(config))
     training.train()
@@ -98,17 +92,3 @@ def test_an_unknown_algorithm_and_a_setting_of_another_are_refused():
         parse({**values, "algo": {**values["algo"], "name": "sac"}})
     with pytest.raises(ConfigError, match=r"^algo\.gamma: no such key"):
         parse({**values, "algo": {**values["algo"], "gamma": 0.9}})
-
-
-def test_the_dense_layers_of_the_policy_are_those_that_the_module_trained():
-    config = make_config(*SMALL)
-    spec, built = policy_spec(config), build_algorithm(config)
-    env = ObservedCorridor(built.env_config)
-    module = built.get_rl_module_spec(env=env).build()
-    networks = algorithm_of(config).networks(module, spec)
-    layers = [*module.encoder.modules(), *module.af.modules()]
-    theirs = [layer.weight for layer in layers if isinstance(layer, torch.nn.Linear)]
-    ours = [layer.weight for layer in networks["pi"].modules() if isinstance(layer, torch.nn.Linear)]
-    assert len(ours) == 3
-    assert all(map(torch.equal, ours, theirs))
-    assert run_name(config) != run_name(make_config(*COLUMNS))

@@ -85,21 +85,15 @@ class Manager:
             self.healthy[index] |= mark_healthy
         return results
 
-    def call_all(self, function):
-        for process in self.processes.values():
-            process.call(function)
-
 
 @pytest.fixture(scope="module")
 def ppo():
     return build_algorithm(make_config(*SHORT, "model=event_columns", "algo.train_batch_size_per_learner=40"))
 
 
-@pytest.fixture
-def make(ppo, monkeypatch):
+@pytest.fixture(scope="module")
+def make(ppo):
     """A function that makes the rounds of a training without Ray, and the manager of its processes."""
-    monkeypatch.setattr(rounds, "ray", SimpleNamespace(put=lambda value: value, get=lambda value: value))
-    monkeypatch.setattr(rounds, "logs_folder", lambda: Path("/the/logs"))
     managers = []
 
     def made():
@@ -108,7 +102,10 @@ def make(ppo, monkeypatch):
         managers.append(Manager(ppo))
         return Rounds(SimpleNamespace(_worker_manager=managers[-1], local_env_runner=local)), managers[-1]
 
-    yield made
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(rounds, "ray", SimpleNamespace(put=lambda value: value, get=lambda value: value))
+        patched.setattr(rounds, "logs_folder", lambda: Path("/the/logs"))
+        yield made
     for manager in managers:
         for process in manager.processes.values():
             process.runner.stop()
@@ -132,12 +129,8 @@ def bytes_of(parts):
         for chunk in part.episodes
     ]
     metrics = [part.metrics[name].peek() for part in parts for name in ("events_per_step", "num_episodes")]
-    return (
-        [part.runner for part in parts],
-        told,
-        metrics,
-        [part.after.values["metrics"]["rounds"] for part in parts],
-    )
+    rounds_before = [part.after.values["metrics"]["rounds"] for part in parts]
+    return [part.runner for part in parts], told, metrics, rounds_before
 
 
 def lost_in_its_work(taking, manager):
@@ -157,60 +150,51 @@ def silent_for_too_long(taking, manager):
     manager.faults[2] = [SILENT]
 
 
-FAULTS = {lost_in_its_work: 1, lost_twice: 1, started_again_unnoticed: 1, silent_for_too_long: 0, None: 0}
+def three_rounds(made, disturb=None, at=1, leave_out=()):
+    """The bytes of three rounds, of which one is disturbed, or not all env runners have its weights."""
+    parts = []
+    for number in range(3):
+        if number:
+            sent(*made, number, leave_out if number == at else ())
+        if disturb is not None and number == at:
+            disturb(*made)
+        parts += bytes_of(made[0].take())
+    return parts
+
+
+@pytest.fixture(scope="module")
+def undisturbed(make):
+    return three_rounds(make())
 
 
 @pytest.mark.parametrize(
-    "fault",
-    [pytest.param(fault, marks=pytest.mark.slow if fault is silent_for_too_long else ()) for fault in FAULTS],
+    ("disturb", "at", "leave_out", "restarts"),
+    [
+        (lost_in_its_work, 0, (), 1),
+        (lost_in_its_work, 1, (), 1),
+        (lost_twice, 1, (), 1),
+        (started_again_unnoticed, 1, (), 1),
+        (None, 1, (2,), 0),
+        (silent_for_too_long, 0, (), 0),
+    ],
 )
-def test_a_round_has_the_same_bytes_whatever_becomes_of_a_process(make, fault):
-    told = []
-    for disturb in (None, fault):
-        taking, manager = make()
-        parts = bytes_of(taking.take())
-        for number in (1, 2):
-            sent(taking, manager, number)
-            if disturb is not None and number == 1:
-                disturb(taking, manager)
-            parts += bytes_of(taking.take())
-        told.append(parts)
-    np.testing.assert_equal(told[1], told[0])
-    assert manager.restarts == FAULTS[fault]
+def test_rounds_have_the_same_bytes_whatever_becomes_of_a_process(
+    make, undisturbed, disturb, at, leave_out, restarts
+):
+    taking, manager = make()
+    np.testing.assert_equal(three_rounds((taking, manager), disturb, at, leave_out), undisturbed)
+    assert manager.restarts == restarts
     assert taking.problems == []
 
 
-def test_weights_that_did_not_arrive_are_sent_again(make):
-    told = []
-    for leave_out in ((), (2,)):
-        taking, manager = make()
-        taking.take()
-        sent(taking, manager, 1, leave_out)
-        told.append(bytes_of(taking.take()))
-    np.testing.assert_equal(told[1], told[0])
-    assert manager.restarts == 0  # its process lives
-
-
-def test_one_that_is_lost_before_its_first_round_begins_as_it_would_have(make):
-    told = []
-    for faults in ([], [ActorUnavailableError("gone", None)]):
-        taking, manager = make()
-        manager.faults[1] = faults
-        told.append(bytes_of(taking.take()))
-    np.testing.assert_equal(told[1], told[0])
-
-
-def test_one_that_has_died_for_good_stops_the_training(make):
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [(ActorDiedError(), "has died 4 times"), (SILENT, "has not started again for 600 s")],
+)
+def test_one_that_does_not_come_back_stops_the_training(make, fault, words):
     taking, manager = make()
-    manager.faults[2] = [ActorUnavailableError("gone", None), ActorDiedError()]
-    with pytest.raises(RolloutError, match=r"^env runner 2 has died 4 times; see /the/logs$"):
-        taking.take()
-
-
-def test_one_that_does_not_come_back_stops_the_training(make):
-    taking, manager = make()
-    manager.faults[2] = [ActorUnavailableError("gone", None), SILENT]
-    with pytest.raises(RolloutError, match=r"^env runner 2 has not started again for 600 s; see /the/logs$"):
+    manager.faults[2] = [ActorUnavailableError("gone", None), fault]
+    with pytest.raises(RolloutError, match=f"^env runner 2 {words}; see /the/logs$"):
         taking.take()
 
 

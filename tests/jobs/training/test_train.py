@@ -26,13 +26,8 @@ ROOT = Path(__file__).resolve().parents[3]
 
 
 def result(**learner):
-    losses = {
-        "policy_loss": 0.1,
-        "vf_loss": 2.0,
-        "vf_explained_var": 0.5,
-        "entropy": 1.0,
-        "gradients_default_optimizer_global_norm": 0.7,
-    }
+    losses = {"policy_loss": 0.1, "vf_loss": 2.0, "vf_explained_var": 0.5, "entropy": 1.0}
+    losses |= {"gradients_default_optimizer_global_norm": 0.7}
     return {
         "num_env_steps_sampled_lifetime": 4096,
         "env_runners": {"num_env_steps_sampled": 2048, "episode_return": 12.5, "num_episodes_lifetime": 3},
@@ -51,10 +46,10 @@ def test_metrics_are_read_from_a_result_and_what_was_not_measured_is_nan():
     assert 12 <= len(metrics) <= 21
 
 
-@pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_a_loss_that_is_not_finite_stops_the_training(bad):
-    with pytest.raises(TrainingError, match=r"train/value_loss = .* at environment step 4096"):
-        read_metrics(result(vf_loss=bad), 2.0, PPO)
+def test_a_loss_that_is_not_finite_stops_the_training():
+    for bad in (math.nan, math.inf):
+        with pytest.raises(TrainingError, match=r"train/value_loss = .* at environment step 4096"):
+            read_metrics(result(vf_loss=bad), 2.0, PPO)
 
 
 # What Ray's memory monitor writes, shortened.
@@ -71,10 +66,8 @@ class Trial:
 
     def __init__(self, folder, *errors):
         self.error_file = str(folder / "error.txt") if errors else None
-        texts = [
-            f"Failure # {k} (occurred at 2026-01-01_00-00-00)\n{text}\n" for k, text in enumerate(errors)
-        ]
-        (folder / "error.txt").write_text("".join(texts))
+        head = "Failure # {} (occurred at 2026-01-01_00-00-00)\n{}\n"
+        (folder / "error.txt").write_text("".join(head.format(*error) for error in enumerate(errors)))
 
 
 def test_what_the_code_raised_stops_and_what_a_lost_process_ended_goes_on(tmp_path, capsys):
@@ -84,53 +77,31 @@ def test_what_the_code_raised_stops_and_what_a_lost_process_ended_goes_on(tmp_pa
     within = str(
         RayTaskError("train", "ray::PPO.train()\nray.exceptions.ActorDiedError: gone", ActorDiedError())
     )
-    for errors in (
-        (raised,),
-        (lost, raised),
-        (raised.replace("ValueError", "jobs.training.sampling.env_runner.RolloutError: KeyError"),),
-    ):
-        with pytest.raises(
-            TrainingError, match=r"^training stopped: \w+Error: no; the same command continues"
-        ):
+    in_flight = raised.replace("ValueError", "jobs.training.sampling.env_runner.RolloutError: KeyError")
+    stops = r"^training stopped: \w+Error: no; the same command continues"
+    for errors in ((raised,), (lost, raised), (in_flight,)):
+        with pytest.raises(TrainingError, match=stops):
             relay.on_trial_recover(1, [], Trial(tmp_path, *errors))
     for errors in ((), (lost,), (within,), (raised, lost), (raised, LOW_MEMORY)):
         relay.on_trial_recover(1, [], Trial(tmp_path, *errors))
-    said = capsys.readouterr().out
+    said = capsys.readouterr().out.replace("\n", " ")
     assert said.count("goes on from its last checkpoint") == 5
-    assert "by Ray, for lack of memory: 6.76GB of 23.54GB in use; stop other programs" in said.replace(
-        "\n", " "
-    )
+    assert "by Ray, for lack of memory: 6.76GB of 23.54GB in use; stop other programs" in said
 
 
-def test_a_results_file_cut_by_a_kill_counts_its_whole_lines(tmp_path):
-    file = tmp_path / "results.jsonl"
-    assert reported_so_far(file)[0] == 0
-    file.write_text('{"env_steps": 64}\n{"env_steps": 128}\n{"env_st')
-    assert reported_so_far(file)[0] == 128
-
-
-def test_half_a_line_left_by_a_kill_is_not_written_on_to(tmp_path):
-    folder = open_run(make_config(f"runs_dir={tmp_path}"))
-    file = folder.train / "results.jsonl"
-    file.parent.mkdir(parents=True)
-    file.write_text('{"env_steps": 64, "train/entropy": 0.5}\n{"env_st')
-    with training._listening(folder, lambda step, metrics: None) as last:
-        assert last == {"train/entropy": 0.5}
-        training._listeners[-1]({**result(), "num_env_steps_sampled_lifetime": 128})
-    assert [json.loads(line)["env_steps"] for line in file.read_text().splitlines()] == [64, 128]
-
-
-def test_a_step_is_reported_once_even_after_a_restart(tmp_path):
+def test_a_step_is_reported_once_even_after_a_kill_that_left_half_a_line(tmp_path):
     folder, seen = open_run(make_config(f"runs_dir={tmp_path}")), []
+    file = folder.train / "results.jsonl"
     for steps in ((64, 128), (128, 192)):
         with training._listening(folder, lambda step, metrics: seen.append(step)) as last:
+            assert last.get("train/episode_return") == (12.5 if seen else None)
             for step in steps:
                 training._listeners[-1]({**result(), "num_env_steps_sampled_lifetime": step})
-    assert seen == [64, 128, 192]
-    assert last["train/episode_return"] == 12.5
-    lines = (folder.train / "results.jsonl").read_text().splitlines()
-    assert [json.loads(line)["env_steps"] for line in lines] == seen
-    assert json.loads(lines[0])["train/success_rate"] is None
+        with file.open("a") as half:
+            half.write('{"env_st')
+    rows = [json.loads(line) for line in file.read_text().splitlines()[:-1]]
+    assert [row["env_steps"] for row in rows] == seen == [64, 128, 192]
+    assert rows[0]["train/success_rate"] is None
     assert training._listeners == []
 
 
@@ -161,14 +132,13 @@ def test_a_training_listens_on_loopback_alone_and_after_a_kill_goes_on_to_a_poli
     before = reported_so_far(results)[0]
     assert 256 <= before < 1600
     subprocess.run(command, cwd=ROOT, check=True, timeout=HANG_S)
-    steps = [json.loads(line)["env_steps"] for line in results.read_text().splitlines()]
+    rows = [json.loads(line) for line in results.read_text().splitlines()]
+    steps, episodes = ([row[name] for row in rows] for name in ("env_steps", "train/episodes"))
     assert steps == sorted(set(steps))
     assert steps[-1] >= 1600
-    rows = [json.loads(line) for line in results.read_text().splitlines()]
     assert {row["evae/drift"] is None for row in rows} == {True, False}  # not measured in each iteration
-    assert json.loads((folder.policy / "encoder.json").read_text())["figures"] == {"reconstruction_step": 0.5}
-    episodes = [json.loads(line)["train/episodes"] for line in results.read_text().splitlines()]
     assert episodes == sorted(episodes)  # counted on, not anew
+    assert json.loads((folder.policy / "encoder.json").read_text())["figures"] == {"reconstruction_step": 0.5}
     policy = load_policy(folder.policy)
     window = np.zeros((1, 4097, 4), np.int32)
     window[0, 0, 2] = 5000
@@ -181,13 +151,8 @@ class Chunk:
 
     def __init__(self, name, rewards, done, success=False):
         self.id_, self.rewards, self.is_done = name, rewards, done
-        self.info = {
-            "num_events": 3,
-            "dropped_events": 0,
-            "success": success,
-            "collision": not success,
-            "distance_m": 7.0,
-        }
+        outcome = {"success": success, "collision": not success, "distance_m": 7.0}
+        self.info = {"num_events": 3, "dropped_events": 0, **outcome}
 
     def get_return(self):
         return sum(self.rewards)
@@ -221,13 +186,9 @@ def test_flights_count_whole_and_stay_in_the_mean_over_iterations(fly_round):
 
 
 def test_a_short_flight_waits_for_those_that_began_with_it(fly_round):
-    assert (
-        fly_round(Chunk("a", [0.0], False), Chunk("b", [0.0], False), Chunk("c", [0.0], True)) == (None,) * 2
-    )
-    assert fly_round(Chunk("a", [0.0], False), Chunk("b", [0.0], True, True), Chunk("d", [0.0], True)) == (
-        None,
-        None,
-    )
+    air, crash = (lambda name, over=over: Chunk(name, [0.0], over) for over in (False, True))
+    assert fly_round(air("a"), air("b"), crash("c")) == (None, None)
+    assert fly_round(air("a"), Chunk("b", [0.0], True, success=True), crash("d")) == (None, None)
     assert fly_round(Chunk("a", [0.0], True, success=True))[1] == 0.5  # a and b won, c and d crashed
 
 

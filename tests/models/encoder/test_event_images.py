@@ -4,31 +4,22 @@ import torch
 
 from models.encoder.evae import EventVAE, event_targets, train_step, validate
 from models.encoder.event_batch import Grid, batch_windows
-from models.encoder.event_images import OFF_SHARE, PictureContextNetwork, event_pictures, last_polarity
+from models.encoder.event_images import event_pictures
 from models.encoder.frozen import encoder_of
 from models.policy.features import event_picture
+from tests.support.encoders import WINDOW_US, make_events
 
-EVENT = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "i1")])
-SIDE, WINDOW_US = 40, 5000
-
-
-def make_events(count, seed=0):
-    rng = np.random.default_rng(seed)
-    events = np.zeros(count, EVENT)
-    events["t"] = np.sort(rng.integers(1, WINDOW_US + 1, count))
-    events["x"], events["y"] = rng.integers(0, SIDE, (2, count))
-    events["p"] = rng.choice([-1, 1], count)
-    return events
+SIDE = 40
 
 
-def make_evae(**settings):
+def make_evae():
     torch.manual_seed(0)
-    return EventVAE("event_image_vae", width=SIDE, height=SIDE, context=64, target="occupancy", **settings)
+    return EventVAE("event_image_vae", width=SIDE, height=SIDE, context=64, target="occupancy")
 
 
 def batch_of(*counts):
-    windows = [(make_events(count, seed), 0, WINDOW_US) for seed, count in enumerate(counts)]
-    return batch_windows(windows, Grid(SIDE, SIDE, 1024))
+    parts = [make_events(count, seed, width=SIDE, height=SIDE) for seed, count in enumerate(counts)]
+    return batch_windows([(events, 0, WINDOW_US) for events in parts], Grid(SIDE, SIDE, 1024))
 
 
 def test_the_picture_is_the_event_image_on_a_scale_where_on_is_one():
@@ -36,30 +27,14 @@ def test_the_picture_is_the_event_image_on_a_scale_where_on_is_one():
     for row, (start, stop) in enumerate(zip(batch.offsets, batch.offsets[1:], strict=False)):
         expected = event_picture(batch.code[start:stop], SIDE, SIDE)
         np.testing.assert_allclose(255.0 * event_pictures(batch)[row, 0], expected, rtol=1e-6)
-    assert np.array_equal(last_polarity(batch), event_targets(batch, "signed").numpy())
-    assert 0.4 < OFF_SHARE < 0.5
-
-
-def test_time_within_the_window_is_not_seen_but_the_last_polarity_is():
-    network = PictureContextNetwork(Grid(SIDE, SIDE, 1024), 64)
-    events = make_events(300)
-    later = events.copy()
-    later["t"] = np.sort(np.random.default_rng(1).integers(1, WINDOW_US + 1, 300))
-    other = events.copy()
-    other["p"][-1] *= -1
-    same, moved, turned = (
-        network(batch_windows([(one, 0, WINDOW_US)], network.grid)) for one in (events, later, other)
-    )
-    assert torch.equal(same, moved)
-    assert not torch.equal(same, turned)
 
 
 def test_it_learns_where_events_were():
     evae, rng = make_evae(), np.random.default_rng(0)
-    optimizer = torch.optim.Adam(evae.parameters(), lr=1e-3)
-    batch = batch_of(*[40] * 8)
+    optimizer = torch.optim.Adam(evae.parameters(), lr=3e-3)
+    batch = batch_of(*[40] * 4)
     targets = event_targets(batch, evae.target)
-    losses = [train_step(evae, optimizer, batch, targets, 1e-6, rng)["loss"] for _ in range(120)]
+    losses = [train_step(evae, optimizer, batch, targets, 1e-6, rng)["loss"] for _ in range(50)]
     assert losses[-1] < 0.5 * losses[0]
     figures = validate(evae.eval(), batch, targets)
     assert figures["reconstruction"] < figures["mean_picture"]
@@ -67,7 +42,7 @@ def test_it_learns_where_events_were():
 
 def test_the_frozen_encoder_gives_the_mean_of_the_latent_for_events_and_for_packed_windows():
     evae = make_evae().freeze()
-    encoder, events = encoder_of(evae), make_events(300)
+    encoder, events = encoder_of(evae), make_events(300, width=SIDE, height=SIDE)
     expected = evae(batch_windows([(events, 7, WINDOW_US)], evae.grid))[1][0].numpy()
     packed = np.zeros((2, 301, 4), np.int32)
     packed[0, 0] = [300, 0, WINDOW_US, 0]

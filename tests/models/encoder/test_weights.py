@@ -17,8 +17,8 @@ from models.encoder.weights import (
     save_encoder,
     without_checksum,
 )
+from tests.support.encoders import WINDOW_US, make_events
 
-EVENT = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "i1")])
 SETTINGS = {
     "variant": "bytestream_xy",
     "width": 6,
@@ -26,16 +26,19 @@ SETTINGS = {
     "context": 16,
     "latent": 3,
     "target": "occupancy",
+    "coding": "none",
 }
+
+
+def window_of(evae):
+    return batch_windows([(make_events(20, width=6, height=5), 0, WINDOW_US)], evae.grid)
 
 
 def make_evae():
     """A small model after one update, so that its running statistics have moved."""
     torch.manual_seed(0)
     evae, rng = EventVAE(**SETTINGS), np.random.default_rng(0)
-    window = np.zeros(20, EVENT)
-    window["x"], window["y"], window["p"] = rng.integers(0, 6, 20), rng.integers(0, 5, 20), 1
-    batch = batch_windows([(window, 0, 10)], evae.grid)
+    batch = window_of(evae)
     train_step(evae, torch.optim.Adam(evae.parameters()), batch, event_targets(batch, "occupancy"), 0.0, rng)
     return evae
 
@@ -83,15 +86,6 @@ def test_an_encoder_from_before_there_was_a_choice_of_coding_comes_back_with_the
     assert torch.equal(loaded.encoder[0].weight, make_evae().encoder[0].weight)
 
 
-def test_an_encoder_of_another_coding_comes_back_with_it(tmp_path):
-    torch.manual_seed(0)
-    evae = EventVAE(**{**SETTINGS, "variant": "bytestream", "coding": "eventnet"})
-    save_encoder(tmp_path / "e.safetensors", evae, {})
-    loaded, _ = load_encoder(tmp_path / "e.safetensors")
-    assert loaded.settings.coding == "eventnet"
-    assert loaded.encoder[0].in_features == 32
-
-
 def test_saving_over_an_encoder_replaces_it_and_leaves_no_other_file(path):
     evae = make_evae()
     with torch.no_grad():
@@ -99,16 +93,6 @@ def test_saving_over_an_encoder_replaces_it_and_leaves_no_other_file(path):
     save_encoder(path, evae, {})
     assert (load_encoder(path)[0].decoder[0].bias == 7).all()
     assert sorted(file.name for file in path.parent.iterdir()) == ["encoder.json", "encoder.safetensors"]
-
-
-def test_every_flipped_bit_is_refused(path):
-    data = bytearray(path.read_bytes())
-    for position in np.linspace(0, len(data) - 1, 25).astype(int):
-        data[position] ^= 1
-        path.write_bytes(data)
-        with pytest.raises(EncoderFileError, match="damaged: SHA-256"):
-            load_encoder(path)
-        data[position] ^= 1
 
 
 def foreign(path):
@@ -123,6 +107,17 @@ def link(file):
     file.symlink_to("elsewhere")
 
 
+def pipe(file):
+    file.unlink()
+    os.mkfifo(file)
+
+
+def flip(path, place):
+    data = bytearray(path.read_bytes())
+    data[place] ^= 1
+    path.write_bytes(data)
+
+
 def cut(path, size, suffix=".safetensors"):
     os.truncate(path.with_suffix(suffix), size)
 
@@ -131,25 +126,10 @@ def describe(path, text):
     path.with_suffix(".json").write_text(text)
 
 
-def of_tensors(path, do):
-    do(path)
-
-
-def of_manifest(path, do):
-    do(path.with_suffix(".json"))
-
-
-def pipe(file):
-    file.unlink()
-    os.mkfifo(file)
-
-
 TENSORS = [
     (lambda t: t["encoder.0.bias"].fill_(float("nan")), "encoder.0.bias has values that are not finite"),
-    (lambda t: t["encoder.0.bias"].fill_(float("inf")), "encoder.0.bias has values that are not finite"),
     (lambda t: t["ecn.norms.0.running_var"].fill_(-1.0), "negative variances"),
     (lambda t: t.pop("encoder.0.bias"), "unexpected or missing tensors"),
-    (lambda t: t.update(more=torch.zeros(1)), "unexpected or missing tensors"),
     (lambda t: t.update({"encoder.0.bias": torch.zeros(3)}), "encoder.0.bias is"),
     (lambda t: t.update({"encoder.0.bias": torch.zeros(256, dtype=torch.float64)}), "encoder.0.bias is"),
 ]
@@ -158,26 +138,24 @@ MANIFESTS = [
     (lambda m: m.update(format=2), "format 2, this version reads 1"),
     (lambda m: m["model"].update(context=10**9), "context: .*got 1000000000"),
     (lambda m: m["model"].update(layers=3), "layers"),
-    (lambda m: m["model"].pop("norm"), "norm"),
     (lambda m: m["model"].update(variant="brp_full"), "variant 'brp_full', .* bytestream now"),
     (lambda m: m.update(model=[1]), "settings are refused"),
     (lambda m: m["model"].update(width=7), "decoder.4.weight is"),
 ]
-READ = {link: "a link, .*; copy", pipe: "no regular file", os.unlink: ""}
 # What is done to the two files, and the rule that reading them states.
 DAMAGES = [
     *((partial(replace_tensors, change=change), rule) for change, rule in TENSORS),
     *((partial(rewrite, change=change), rule) for change, rule in MANIFESTS),
-    *((partial(cut, size=size), r"encoder\.safetensors: damaged") for size in (0, 7, 1000)),
-    *((partial(describe, text=text), r"encoder\.json") for text in ("", "{", "[]", "[" * 100_000, "\x00")),
-    (foreign, "not a safetensors file"),
+    *((partial(describe, text=text), r"encoder\.json") for text in ("{", "[]", "[" * 100_000)),
+    *((partial(flip, place=place), "damaged: SHA-256") for place in (0, 1000, -1)),
+    (partial(cut, size=0), r"encoder\.safetensors: damaged"),
     (partial(cut, size=1 << 33), "8589934592 bytes, at most"),
     (partial(cut, size=1 << 33, suffix=".json"), f"at most {MAX_MANIFEST_BYTES}"),
-    *(
-        (partial(of_tensors, do=do), rf"encoder\.safetensors: cannot be read: {why}")
-        for do, why in READ.items()
-    ),
-    *((partial(of_manifest, do=do), rf"encoder\.json: cannot be read: {why}") for do, why in READ.items()),
+    (foreign, "not a safetensors file"),
+    (link, r"encoder\.safetensors: cannot be read: a link, .*; copy"),
+    (pipe, r"encoder\.safetensors: cannot be read: no regular file"),
+    (os.unlink, r"encoder\.safetensors: cannot be read"),
+    (lambda path: link(path.with_suffix(".json")), r"encoder\.json: cannot be read: a link"),
 ]
 
 
@@ -196,6 +174,8 @@ def test_a_manifest_that_cannot_be_recorded_is_refused_and_nothing_is_written(tm
 
 
 def test_a_model_that_is_not_finite_or_not_float32_is_never_written(tmp_path):
+    with pytest.raises(EncoderFileError, match=r"ends in \.safetensors"):
+        save_encoder(tmp_path / "encoder.pt", make_evae(), {})
     broken = make_evae()
     with torch.no_grad():
         broken.encoder[0].weight[0, 0] = float("nan")
@@ -205,21 +185,13 @@ def test_a_model_that_is_not_finite_or_not_float32_is_never_written(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_name_with_another_ending_is_refused(tmp_path):
-    with pytest.raises(EncoderFileError, match=r"ends in \.safetensors"):
-        load_encoder(tmp_path / "encoder.pt")
-
-
 def test_a_lean_file_flies_nearly_the_same_and_draws_nothing(tmp_path, path):
     whole, lean = make_evae().eval(), tmp_path / "lean.safetensors"
     save_encoder(lean, whole, {}, lean=True)
     loaded, _ = load_encoder(lean)
     assert loaded.decoder is None
     assert lean.stat().st_size < path.stat().st_size / 10
-    window = np.zeros(9, EVENT)
-    window["t"], window["x"], window["y"], window["p"] = range(1, 10), np.arange(9) % 6, np.arange(9) % 5, 1
-    batch = batch_windows([(window, 0, 10)], whole.grid)
-    found, expected = (model.encoder(model.ecn(batch)) for model in (loaded, whole))
+    found, expected = (model.encoder(model.ecn(window_of(whole))) for model in (loaded, whole))
     torch.testing.assert_close(found, expected, atol=5e-3, rtol=5e-3)
     assert not torch.equal(found, expected)
     again = tmp_path / "again.safetensors"

@@ -1,27 +1,26 @@
 import itertools
-from typing import get_args
 
 import numpy as np
 import pytest
-from hypothesis import given, strategies
+from hypothesis import given, settings, strategies
 
-from core.places import resolve
-from envs.config import CameraConfig, EnvConfig, Observation
+from envs.config import CameraConfig, EnvConfig
 from envs.corridor import CorridorEnv
-from envs.events import EVENT, event_image, pack_window
-from models.kinds import KINDS, ColumnsModel, FixedModel, PolicySpec, RecurrentModel, read_model
+from envs.events import EVENT, event_image, pack_window, unpack_window
+from models.kinds import KINDS, ColumnsModel, FixedModel, PolicySpec, read_model
 from models.policy import Policy
-from models.policy.features import Feature, Step, feature_of, grey_picture, push_features
-from models.policy.networks import Network, build_networks
+from models.policy.features import Step, feature_of, grey_picture, push_features
+from models.policy.mirror import mirror
+from models.policy.networks import build_networks
 
 WIDTH, HEIGHT, WINDOW_US = 6, 4, 5000
 SIZES = (WIDTH, HEIGHT, 3)
-OWN = {ColumnsModel: {"hidden": [8]}, RecurrentModel: {"units": 8}}  # settings beside name and stack
 COLUMNS = PolicySpec(ColumnsModel("event_columns", 3, [8]), *SIZES)
 PICTURE = PolicySpec(FixedModel("event_image", 3), *SIZES)
 
 
-def make_events(rng, count):
+def make_events(seed, count):
+    rng = np.random.default_rng(seed)
     events = np.empty(count, EVENT)
     events["t"] = np.sort(rng.integers(1, WINDOW_US + 1, count))
     events["x"], events["y"] = rng.integers(0, WIDTH, count), rng.integers(0, HEIGHT, count)
@@ -29,40 +28,30 @@ def make_events(rng, count):
     return events
 
 
-def columns(events):
-    """Columns of a packed window."""
+def features(spec, events):
+    """The feature of a packed window."""
     window = pack_window(events, 0, WINDOW_US, 200)
-    return feature_of(COLUMNS).from_observations(window[None], COLUMNS, None)[0]
+    return feature_of(spec).from_observations(window[None], spec, None)[0]
 
 
-seeds = strategies.integers(0, 2**32 - 1)
-counts = strategies.integers(0, 150)
-
-
-@given(seeds, counts)
-def test_columns_count_every_event_once_in_its_column_and_polarity(seed, count):
-    events = make_events(np.random.default_rng(seed), count)
-    expected = np.zeros((2, WIDTH))
-    for event in events:
-        expected[0 if event["p"] > 0 else 1, event["x"]] += 1
-    counted = np.expm1(columns(events).astype(float))
-    np.testing.assert_allclose(counted.reshape(2, WIDTH), expected, atol=1e-4)
-    assert counted.sum() == pytest.approx(count, abs=1e-3)
-
-
+streams = strategies.builds(make_events, strategies.integers(0, 2**32 - 1), strategies.integers(0, 150))
 edges = strategies.lists(strategies.integers(0, HEIGHT + 1), min_size=2, unique=True).map(sorted)
 
 
-@given(seeds, counts, edges)
-def test_bands_count_the_columns_of_their_rows(seed, count, bands):
-    events = make_events(np.random.default_rng(seed), count)
-    spec = PolicySpec(ColumnsModel("event_columns", 3, [8], bands=bands), *SIZES)
-    made = feature_of(spec).from_observations(pack_window(events, 0, WINDOW_US, 200)[None], spec, None)
-    assert made.shape == (1, *feature_of(spec).shape(spec))
-    for band, (begin, end) in enumerate(itertools.pairwise(bands)):
-        inside = events[(events["y"] >= begin) & (events["y"] < end)]
-        own = made[0].reshape(2, len(bands) - 1, WIDTH)[:, band]
-        np.testing.assert_array_equal(own.ravel(), columns(inside))
+@settings(max_examples=30)
+@given(streams, edges)
+def test_columns_count_every_event_once_in_its_column_and_polarity_and_bands_those_of_their_rows(
+    events, bands
+):
+    for rows, given_bands in (([0, HEIGHT], []), (bands, bands)):
+        expected = np.zeros((2, len(rows) - 1, WIDTH))
+        for event in events:
+            for band, (begin, end) in enumerate(itertools.pairwise(rows)):
+                expected[0 if event["p"] > 0 else 1, band, event["x"]] += begin <= event["y"] < end
+        spec = PolicySpec(ColumnsModel("event_columns", 3, [8], bands=given_bands), *SIZES)
+        made = features(spec, events)
+        assert made.shape == feature_of(spec).shape(spec)
+        np.testing.assert_allclose(np.expm1(made.astype(float)), expected.ravel(), atol=1e-4)
 
 
 @pytest.mark.parametrize("bands", [[3], [3, 3], [4, 2], [-1, 3]])
@@ -71,67 +60,18 @@ def test_bands_that_do_not_rise_are_refused(bands):
         read_model(name="event_columns", stack=3, hidden=[8], bands=bands)
 
 
-@given(seeds, counts)
-def test_columns_do_not_know_the_order_nor_the_row_of_events(seed, count):
-    rng = np.random.default_rng(seed)
-    events = make_events(rng, count)
-    mixed = events.copy()
-    for column in range(WIDTH):
-        rows = np.flatnonzero(events["x"] == column)
-        for name in "yp":
-            mixed[name][rows] = rng.permutation(events[name][rows])
-    mixed["y"] = rng.integers(0, HEIGHT, count)
-    np.testing.assert_array_equal(columns(mixed), columns(events))
-
-
-def test_an_event_moved_to_another_column_or_polarity_changes_the_columns():
-    events = make_events(np.random.default_rng(0), 30)
-    for name, value in (("x", (events["x"][3] + 1) % WIDTH), ("p", -events["p"][3])):
-        moved = events.copy()
-        moved[name][3] = value
-        assert np.count_nonzero(columns(moved) != columns(events)) == 2
-
-
-@given(seeds, counts)
-def test_the_events_of_a_step_give_what_their_window_and_their_image_give(seed, count):
-    events = make_events(np.random.default_rng(seed), count)
+@settings(max_examples=30)
+@given(streams)
+def test_the_events_of_a_step_give_what_their_window_and_their_image_give(events):
     later = events.copy()
     later["t"] += 70_000
-    for spec, expected in ((COLUMNS, columns(events)), (PICTURE, event_image(events, WIDTH, HEIGHT))):
+    for spec, expected in (
+        (COLUMNS, features(COLUMNS, events)),
+        (PICTURE, event_image(events, WIDTH, HEIGHT)),
+    ):
         made = feature_of(spec).from_events(Step(later, 70_000, WINDOW_US), spec, None)
         np.testing.assert_array_equal(made, expected)
         assert made.dtype == expected.dtype
-
-
-@pytest.mark.parametrize("name", ["event_columns", "event_set"])
-def test_windows_of_any_lengths_give_the_features_of_each(name):
-    spec = PolicySpec(KINDS[name].settings(name=name, stack=3, **OWN.get(KINDS[name].settings, {})), *SIZES)
-    rng = np.random.default_rng(0)
-    steps = [make_events(rng, count) for count in (5, 0, 400, 1)]
-    feature = feature_of(spec)
-    packed = tuple(pack_window(step, 0, WINDOW_US, max(len(step), 1))[: len(step) + 1] for step in steps)
-    made = feature.from_observations(packed, spec, None)
-    assert (made.dtype, made.shape) == (feature.dtype, (4, *feature.shape(spec)))
-    for row, step in zip(made, steps, strict=True):
-        np.testing.assert_array_equal(row, feature.from_events(Step(step, 0, WINDOW_US), spec, None))
-    assert Policy(build_networks(spec), spec)(packed[:1]).shape == (1,)
-
-
-def test_the_last_event_of_a_pixel_colours_it():
-    events = np.zeros(3, EVENT)
-    events["t"], events["x"], events["p"] = [1, 2, 3], [2, 2, 5], [1, -1, 1]
-    made = feature_of(PICTURE).from_events(Step(events, 0, WINDOW_US), PICTURE, None)
-    np.testing.assert_array_equal(made[0], [0, 0, 125, 0, 0, 255])
-    assert not made[1:].any()
-
-
-@pytest.mark.parametrize(("name", "value"), [("x", WIDTH), ("y", HEIGHT), ("p", 0)])
-@pytest.mark.parametrize("spec", [COLUMNS, PICTURE], ids=["columns", "picture"])
-def test_an_event_that_the_sensor_cannot_make_is_refused(spec, name, value):
-    events = make_events(np.random.default_rng(1), 5)
-    events[name][2] = value
-    with pytest.raises(ValueError, match="event 2 has"):
-        feature_of(spec).from_events(Step(events, 0, WINDOW_US), spec, None)
 
 
 def test_grey_is_what_a_display_decodes_to_the_luminance_again():
@@ -154,15 +94,14 @@ def test_pictures_of_another_sensor_or_type_are_refused(name):
             feature_of(spec).from_observations(bad, spec, None)
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.uint8, np.int16])
-@pytest.mark.parametrize("shape", [(2,), (4, 5)])
+@pytest.mark.parametrize(("dtype", "shape"), [(np.float32, (2,)), (np.uint8, (4, 5))])
 def test_the_first_feature_fills_the_stack_and_later_ones_push_out_the_oldest(dtype, shape):
     values = np.random.default_rng(0).integers(0, 100, (6, 2, *shape)).astype(dtype)
     stacks = np.zeros((2, 3, *shape), dtype)
     firsts = np.array([[True, True], *[[False, False]] * 3, [False, True], [False, False]])
-    for step, (features, first) in enumerate(zip(values, firsts, strict=True)):
+    for step, (newest, first) in enumerate(zip(values, firsts, strict=True)):
         before = stacks.copy()
-        pushed = push_features(stacks, features, first)
+        pushed = push_features(stacks, newest, first)
         np.testing.assert_array_equal(stacks, before)
         stacks = pushed
         for flight, start in ((0, 0), (1, 0 if step < 4 else 4)):
@@ -171,12 +110,10 @@ def test_the_first_feature_fills_the_stack_and_later_ones_push_out_the_oldest(dt
     assert stacks.dtype == dtype
 
 
-@pytest.mark.parametrize("name", [name for name, kind in KINDS.items() if not kind.encoder])
+@pytest.mark.parametrize("name", ["event_image", "rgb"])
 def test_each_kind_takes_what_the_environment_shows_it(name):
     env = CorridorEnv(EnvConfig(observation=KINDS[name].observation, camera=CameraConfig(40, 48)))
-    spec = PolicySpec(
-        KINDS[name].settings(name=name, stack=3, **OWN.get(KINDS[name].settings, {})), 40, 48, 3
-    )
+    spec = PolicySpec(FixedModel(name, 3), 40, 48, 3)
     policy = Policy(build_networks(spec), spec)
     observation, _ = env.reset(seed=0)
     for _ in range(3):
@@ -187,10 +124,39 @@ def test_each_kind_takes_what_the_environment_shows_it(name):
     assert made.any()
 
 
-def test_the_table_of_kinds_names_what_there_is():
-    for kind in KINDS.values():
-        assert isinstance(resolve(kind.feature), Feature)
-        assert isinstance(resolve(kind.network), Network)
-        assert kind.onnx is None or callable(resolve(kind.onnx))
-        assert kind.observation in get_args(Observation)
-        EnvConfig(observation=kind.observation)
+batches = strategies.tuples(strategies.integers(0, 2**32 - 1), strategies.lists(strategies.integers(0, 60)))
+
+
+@settings(max_examples=30)
+@given(batches, strategies.booleans())
+def test_mirrored_windows_hold_the_same_events_in_the_mirrored_columns(batch, padded):
+    seed, counts = batch
+    told = [make_events(seed + k, n) for k, n in enumerate(counts)]
+    windows = [pack_window(events, 0, WINDOW_US, 60 if padded else max(1, len(events))) for events in told]
+    if padded and windows:
+        windows = np.stack(windows)
+    before = [window.copy() for window in windows]
+    mirrored = mirror(windows, COLUMNS)
+    assert isinstance(mirrored, np.ndarray) == isinstance(windows, np.ndarray)
+    for window, kept, other, events in zip(windows, before, mirrored, told, strict=True):
+        np.testing.assert_array_equal(window, kept)
+        found, window_us = unpack_window(other)
+        assert window_us == WINDOW_US
+        np.testing.assert_array_equal(found["x"], WIDTH - 1 - events["x"])
+        for name in "typ":
+            np.testing.assert_array_equal(found[name], events[name])
+
+
+@pytest.mark.parametrize(("name", "dtype"), [("event_image", np.uint8), ("rgb", np.float32)])
+def test_pictures_are_turned_about_their_middle_column(name, dtype):
+    pictures = np.arange(48).reshape(2, HEIGHT, WIDTH).astype(dtype)
+    mirrored = mirror(pictures, PolicySpec(FixedModel(name, 3), *SIZES))
+    assert mirrored.dtype == dtype
+    for x in range(WIDTH):
+        np.testing.assert_array_equal(mirrored[:, :, x], pictures[:, :, WIDTH - 1 - x])
+
+
+def test_an_observation_without_a_known_mirror_image_is_refused(monkeypatch):
+    monkeypatch.setitem(KINDS, "rgb", KINDS["rgb"]._replace(observation="none"))
+    with pytest.raises(ValueError, match="'none'"):
+        mirror(np.zeros((1, 2)), PolicySpec(FixedModel("rgb", 3), *SIZES))

@@ -8,74 +8,66 @@ from models.policy.networks import build_networks
 from tests.support.policies import ABOUT, SIDE, make_evae, make_spec, make_windows
 
 TAUS = [10.0, 30.0, 100.0]
-SPEC = make_spec("event_columns", memory_ms=TAUS)
-NONE = np.zeros(1, int)
 
 
-def kept_after(features, window_us):
-    """What is kept of one episode's features (T, n)."""
-    kept = np.zeros((1, SPEC.depth, features.shape[1]), np.float32)
-    for step, feature in enumerate(features):
-        kept = remember(kept, feature[None], np.array([step == 0]), SPEC, window_us[step : step + 1], NONE)
-    return kept[0]
+def policy_of(spec, folder, evae=None):
+    """Saved and loaded, with logits that differ."""
+    networks = build_networks(spec, seed=3)
+    *_, last = networks["pi"].modules()
+    last.weight.data.mul_(100.0)
+    return load_policy(save_policy(folder, networks, spec, ABOUT, evae))
+
+
+def step_of(window):
+    """Events, start and length of a packed window."""
+    count, _, window_us, _ = window[0]
+    return dict(zip("txyp", window[1 : count + 1].T, strict=True)), 0, window_us
 
 
 def test_means_are_those_of_the_whole_past():
-    rng = np.random.default_rng(0)
+    rng, spec = np.random.default_rng(0), make_spec("event_columns", memory_ms=TAUS)
     features, window_us = rng.normal(size=(30, 4)).astype("f4"), rng.integers(1000, 40_000, 30)
-    kept = kept_after(features, window_us)
-    np.testing.assert_array_equal(kept[-1], features[-1])
+    kept = np.zeros((1, spec.depth, 4), np.float32)
+    for step, feature in enumerate(features):
+        first, own_us = np.array([step == 0]), window_us[step : step + 1]
+        kept = remember(kept, feature[None], first, spec, own_us, np.zeros(1, int))
+    np.testing.assert_array_equal(kept[0, -1], features[-1])
     since_us = window_us.sum() - np.cumsum(window_us)  # since the end of each step
-    for mean, tau in zip(kept[:-1], TAUS, strict=True):
+    for mean, tau in zip(kept[0, :-1], TAUS, strict=True):
         weights = np.exp(-since_us / (1e3 * tau)) - np.exp(-(since_us + window_us) / (1e3 * tau))
         weights[0] = np.exp(-since_us[0] / (1e3 * tau))  # what was before the first is like the first
         assert weights.sum() == pytest.approx(1.0)
         np.testing.assert_allclose(mean, weights @ features, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("parts", [2, 7])
-def test_a_step_in_parts_is_remembered_as_the_whole(parts):
-    rng = np.random.default_rng(1)
-    features, window_us = rng.normal(size=(9, 3)).astype("f4"), rng.integers(5, 50, 9) * 7 * 200
-    whole = kept_after(features, window_us)
-    found = kept_after(np.repeat(features, parts, axis=0), np.repeat(window_us // parts, parts))
-    np.testing.assert_allclose(found, whole, rtol=1e-4, atol=1e-5)
-
-
 def test_an_episode_that_begins_forgets_and_its_neighbours_remember():
-    rng = np.random.default_rng(2)
+    rng, spec = np.random.default_rng(2), make_spec("event_columns", memory_ms=TAUS)
     kept, features = rng.normal(size=(3, 4, 5)).astype("f4"), rng.normal(size=(3, 5)).astype("f4")
     before, first = kept.copy(), np.array([False, True, False])
-    after = remember(kept, features, first, SPEC, 5000, np.zeros(3, int))
+    after = remember(kept, features, first, spec, 5000, np.zeros(3, int))
     np.testing.assert_array_equal(kept, before)
     np.testing.assert_array_equal(after[1], np.stack([features[1]] * 4))
-    alone = remember(kept[2:], features[2:], first[2:], SPEC, np.array([5000]), NONE)
+    alone = remember(kept[2:], features[2:], first[2:], spec, np.array([5000]), np.zeros(1, int))
     np.testing.assert_array_equal(after[2:], alone)
     assert after.dtype == np.float32
 
 
-def test_a_policy_with_memory_keeps_it_in_its_folder_and_acts_by_it(tmp_path):
-    evae, spec = make_evae(), make_spec("bytestream", memory_ms=TAUS)
-    networks = build_networks(spec, seed=3)
-    networks["pi"][-1].weight.data.mul_(100.0)
-    policy = load_policy(save_policy(tmp_path / "policy", networks, spec, ABOUT, evae))
+def test_a_policy_with_memory_keeps_it_in_its_folder_and_acts_by_the_length_of_its_steps(tmp_path):
+    spec = make_spec("bytestream", memory_ms=TAUS)
+    policy = policy_of(spec, tmp_path / "policy", make_evae())
     assert policy.spec == spec
     assert policy.stack_shape == (4, 8)
     windows = make_windows(np.random.default_rng(0), 12, side=SIDE)
-    windows[6:, 0, 2] = 20_000
-    shown = np.array([policy.logits(window[None])[0] for window in windows])
-    policy.reset()
-    for window, expected in zip(windows, shown, strict=True):
-        count, _, window_us, _ = window[0]
-        t, x, y, p = window[1 : count + 1].T
-        np.testing.assert_array_equal(
-            policy.event_logits({"t": t, "x": x, "y": y, "p": p}, 0, window_us), expected
-        )
-    policy.reset()
-    windows[6:, 0, 2] = 5000
-    faster = np.array([policy.logits(window[None])[0] for window in windows])
-    np.testing.assert_array_equal(faster[:6], shown[:6])
-    assert np.abs(faster[6:] - shown[6:]).max() > 0.0
+    shown = []
+    for later_us in (20_000, 5000):
+        windows[6:, 0, 2] = later_us
+        policy.reset()
+        shown.append(np.array([policy.logits(window[None])[0] for window in windows]))
+        policy.reset()
+        for window, expected in zip(windows, shown[-1], strict=True):
+            np.testing.assert_array_equal(policy.event_logits(*step_of(window)), expected)
+    np.testing.assert_array_equal(shown[0][:6], shown[1][:6])
+    assert np.abs(shown[0][6:] - shown[1][6:]).max() > 0.0
 
 
 def test_a_policy_from_before_has_a_stack():
@@ -85,10 +77,22 @@ def test_a_policy_from_before_has_a_stack():
     assert read_spec(values).depth == 3
 
 
-def test_latents_that_change_while_learning_have_no_memory_in_time():
-    values = make_spec("finetuned").manifest() | {"memory_ms": [10.0]}
-    with pytest.raises(ValueError, match=r"memory_ms must be \[\] for encoder=finetuned, .*got \[10\.0\]"):
-        read_spec(values)
+@pytest.mark.parametrize(
+    ("name", "value"), [("memory_ms", [10.0]), ("own_actions", True), ("own_velocity", True)]
+)
+def test_networks_that_read_events_or_pictures_have_no_memory_in_time_and_see_nothing_of_the_vehicle(
+    name, value, monkeypatch
+):
+    with pytest.raises(ValueError, match=rf"{name} must be (\[\]|false) for encoder=finetuned"):
+        read_spec(make_spec("finetuned").manifest() | {name: value})
+    pictured = KINDS["event_columns"]._replace(feature="models.policy.features:EVENT_IMAGE")
+    monkeypatch.setitem(KINDS, "pictured", pictured)
+    if value is True:
+        with pytest.raises(ValueError, match=f"{name} must be false for pictured"):
+            kept_shape(make_spec("pictured", **{name: True}))
+
+
+def test_a_time_constant_of_nothing_is_refused():
     with pytest.raises(ValueError, match=r"memory_ms\.0: .*greater than 0, got 0\.0"):
         checked(read_model, {"name": "event_columns", "stack": 3, "hidden": [8], "memory_ms": [0.0]})
 
@@ -113,13 +117,9 @@ def test_own_actions_are_remembered_as_features_are(memory_ms):
     np.testing.assert_array_equal(kept[..., 2 * SIDE :], told)
 
 
-@pytest.mark.parametrize("name", ["event_columns", "event_columns_gru"])
-def test_a_policy_sees_the_actions_that_were_taken_from_observations_and_from_events(name, tmp_path):
-    spec = make_spec(name, memory_ms=TAUS, own_actions=True)
-    networks = build_networks(spec, seed=3)
-    *_, last = networks["pi"].modules()
-    last.weight.data.mul_(100.0)
-    policy = load_policy(save_policy(tmp_path / "policy", networks, spec, ABOUT))
+def test_a_policy_sees_the_actions_that_were_taken_from_observations_and_from_events(tmp_path):
+    spec = make_spec("event_columns_gru", memory_ms=TAUS, own_actions=True)
+    policy = policy_of(spec, tmp_path / "policy")
     windows = make_windows(np.random.default_rng(0), 12, side=SIDE)
 
     def logits(forced=None):
@@ -133,12 +133,7 @@ def test_a_policy_sees_the_actions_that_were_taken_from_observations_and_from_ev
 
     own = logits()
     policy.reset()
-    chosen = []
-    for window in windows:
-        count, _, window_us, _ = window[0]
-        t, x, y, p = window[1 : count + 1].T
-        chosen.append(policy.act({"t": t, "x": x, "y": y, "p": p}, 0, window_us))
-    assert chosen == own.argmax(axis=1).tolist()
+    assert [policy.act(*step_of(window)) for window in windows] == own.argmax(axis=1).tolist()
     forced = [logits(action) for action in range(3)]
     for one in forced:
         np.testing.assert_array_equal(one[0], own[0])  # nothing was taken before the first
@@ -156,34 +151,20 @@ def test_velocity_is_remembered_in_units_of_ten_metres_a_second_behind_the_actio
     kept = remember(kept, features, ~first, spec, 5000, taken, 0.0 * velocity)
     shares = np.append(np.exp(-5.0 / np.array(TAUS)), 0.0)  # of the mean that outlives the step
     np.testing.assert_allclose(kept[0, :, -1], shares, rtol=1e-6)
-    for missing in (None, np.full((2, 2), np.nan)):
-        with pytest.raises(ValueError, match=r"set policy\.velocity_mps \(B, 2\) before each step"):
-            remember(kept, features, first, spec, 5000, taken, missing)
+    with pytest.raises(ValueError, match=r"reads the vehicle's velocity.*got None"):
+        remember(kept, features, first, spec, 5000, taken)
 
 
-@pytest.mark.parametrize("name", ["event_columns", "event_columns_gru"])
-def test_a_policy_reads_the_velocity_that_it_is_told(name, tmp_path):
-    spec = make_spec(name, own_velocity=True)
-    networks = build_networks(spec, seed=3)
-    *_, last = networks["pi"].modules()
-    last.weight.data.mul_(100.0)
-    policy = load_policy(save_policy(tmp_path / "policy", networks, spec, ABOUT))
+def test_a_policy_reads_the_velocity_that_it_is_told_and_asks_for_it(tmp_path):
+    policy = policy_of(make_spec("event_columns", own_velocity=True), tmp_path / "policy")
     window = make_windows(np.random.default_rng(0), 1, side=SIDE)
-    with pytest.raises(ValueError, match="reads the vehicle's velocity"):
-        policy.logits(window)
     shown = []
     for ahead_mps in (10.0, 20.0):
         policy.reset()
+        with pytest.raises(
+            ValueError, match=r"set policy\.velocity_mps \(B, 2\) before .*got \[\[nan nan\]\]"
+        ):
+            policy.logits(window)
         policy.velocity_mps = np.array([[0.0, ahead_mps]])
         shown.append(policy.logits(window))
     assert np.abs(shown[0] - shown[1]).max() > 0.0
-
-
-@pytest.mark.parametrize("name", ["own_actions", "own_velocity"])
-def test_networks_that_read_events_or_pictures_see_nothing_of_the_vehicle(name, monkeypatch):
-    with pytest.raises(ValueError, match=f"{name} must be false for encoder=finetuned"):
-        read_spec(make_spec("finetuned").manifest() | {name: True})
-    pictured = KINDS["event_columns"]._replace(feature="models.policy.features:EVENT_IMAGE")
-    monkeypatch.setitem(KINDS, "pictured", pictured)
-    with pytest.raises(ValueError, match=f"{name} must be false for pictured"):
-        kept_shape(make_spec("pictured", **{name: True}))

@@ -15,9 +15,10 @@ from envs.config import CameraConfig, EnvConfig, FaultsConfig, FidelityConfig, s
 from envs.corridor import CorridorEnv
 from models.encoder.frozen import encoder_of
 from models.policy import Policy, load_policy, save_policy
-from models.policy.features import Step, feature_of
+from models.policy.features import feature_of
 from models.policy.networks import build_networks
 from models.policy.policy import ENCODER, MANIFEST
+from tests.support.encoders import EVENT
 from tests.support.policies import (
     ABOUT,
     RECURRENT,
@@ -30,39 +31,16 @@ from tests.support.policies import (
     save,
 )
 
-EVENT = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "i1")])
 
-
-@pytest.fixture(scope="module", params=TRAINED)
-def name(request):
-    return request.param
-
-
-@pytest.fixture
-def folder(tmp_path, name):
-    return save(tmp_path / "policy", name)
-
-
-@pytest.fixture
-def encoded(tmp_path):
-    return save(tmp_path / "policy", "bytestream")
-
-
-def make_observations(name, rng, count):
-    """What an environment might show, (count, ...)."""
+def make_observations(name, seed, *shape):
+    """What an environment might show, (*shape, ...)."""
+    rng, count = np.random.default_rng(seed), int(np.prod(shape))
     if make_spec(name).kind.observation == "window":
-        return make_windows(rng, count, side=SIDE)
-    pictures = rng.choice([0, 0, 0, 125, 255], (count, SIDE, SIDE)).astype(np.uint8)
-    return pictures if name == "event_image" else (pictures / 255).astype(np.float32)
-
-
-def step_events(window, start_us):
-    rows = window[1 : window[0, 0] + 1]
-    events = np.empty(len(rows), EVENT)
-    for column, field in enumerate("txyp"):
-        events[field] = rows[:, column]
-    events["t"] += start_us
-    return events
+        shown = make_windows(rng, count, side=SIDE)
+    else:
+        shown = rng.choice([0, 0, 0, 125, 255], (count, SIDE, SIDE)).astype(np.uint8)
+        shown = shown if name == "event_image" else (shown / 255).astype(np.float32)
+    return shown.reshape(*shape, *shown.shape[1:])
 
 
 def expected_logits(name, flights):
@@ -82,10 +60,10 @@ def expected_logits(name, flights):
         return networks["pi"](networks["trunk"](shown[:, -1])).numpy()
 
 
-def test_a_policy_folder_alone_gives_the_logits_of_the_policy_that_was_saved(name, folder):
-    policy = load_policy(folder)
-    flights = make_observations(name, np.random.default_rng(0), 20)
-    flights = flights.reshape(5, 4, *flights.shape[1:])
+@pytest.mark.parametrize("name", TRAINED)
+def test_a_policy_folder_alone_gives_the_logits_of_the_policy_that_was_saved(name, tmp_path):
+    policy = load_policy(save(tmp_path / "policy", name))
+    flights = make_observations(name, 0, 5, 4)
     policy.reset(5)
     for t in range(1, 5):
         logits = policy.logits(flights[:, t - 1])
@@ -95,8 +73,9 @@ def test_a_policy_folder_alone_gives_the_logits_of_the_policy_that_was_saved(nam
     assert policy.observation == make_spec(name).kind.observation
 
 
-def test_the_same_policy_is_saved_as_the_same_bytes_and_each_file_has_its_sum(name, folder, tmp_path):
-    again = save(tmp_path / "again", name)
+@pytest.mark.parametrize("name", ["bytestream", "rgb"])
+def test_the_same_policy_is_saved_as_the_same_bytes_and_each_file_has_its_sum(name, tmp_path):
+    folder, again = save(tmp_path / "policy", name), save(tmp_path / "again", name)
     files = sorted(path.name for path in folder.iterdir())
     assert files == sorted(path.name for path in again.iterdir())
     assert (ENCODER in files) is make_spec(name).frozen
@@ -108,58 +87,39 @@ def test_the_same_policy_is_saved_as_the_same_bytes_and_each_file_has_its_sum(na
     }
 
 
-def test_a_restarted_flight_forgets_and_its_neighbours_remember(name, folder):
-    steps = make_observations(name, np.random.default_rng(1), 12)
-    steps = steps.reshape(4, 3, *steps.shape[1:])
-    kept, restarted, alone = load_policy(folder), load_policy(folder), load_policy(folder)
-    kept.reset(3)
-    restarted.reset(3)
+@pytest.mark.parametrize("name", ["bytestream", "event_columns_gru", "event_image"])
+def test_in_mid_episode_a_restart_forgets_what_is_kept_stays_and_copies_go_on(name, tmp_path):
+    steps = make_observations(name, 1, 5, 3)
+    policy, fresh = load_policy(save(tmp_path / "policy", name)), load_policy(tmp_path / "policy")
+    policy.reset(3)
     for step in steps[:3]:
-        kept.logits(step)
-        restarted.logits(step)
-    whole = kept.logits(steps[3])
-    part = restarted.logits(steps[3], np.array([False, True, False]))
-    np.testing.assert_array_equal(part[[0, 2]], whole[[0, 2]])
-    assert not np.array_equal(part[1], whole[1])
-    np.testing.assert_allclose(part[1], alone.logits(steps[3][1:2])[0], rtol=1e-5, atol=1e-5)
+        policy.logits(step)
+    copies = [copy.deepcopy(policy), pickle.loads(pickle.dumps(policy)), copy.copy(policy)]
+    restarted, kept = copy.deepcopy(policy), copy.deepcopy(policy)
+    whole = [policy.logits(step) for step in steps[3:]]
+    for other in copies:
+        np.testing.assert_array_equal([other.logits(step) for step in steps[3:]], whole)
+    begins = np.array([False, True, False])
+    part = [restarted.logits(steps[3], begins), restarted.logits(steps[4])]
+    kept.keep(np.array([2, 0]))
+    for step, found, expected in zip(steps[3:], part, whole, strict=True):
+        np.testing.assert_array_equal(found[[0, 2]], expected[[0, 2]])
+        assert not np.array_equal(found[1], expected[1])
+        np.testing.assert_allclose(found[1], fresh.logits(step[1:2])[0], rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(kept.logits(step[[2, 0]]), expected[[2, 0]], rtol=1e-5, atol=1e-5)
 
 
-def test_episodes_that_are_kept_go_on_as_if_the_others_were_there(name, folder):
-    steps = make_observations(name, np.random.default_rng(1), 12)
-    steps = steps.reshape(4, 3, *steps.shape[1:])
-    whole, some = load_policy(folder), load_policy(folder)
-    for policy in (whole, some):
-        policy.reset(3)
-        policy.logits(steps[0])
-        policy.logits(steps[1])
-    some.keep(np.array([0, 2]))
-    for step in steps[2:]:
-        expected = whole.logits(step)[[0, 2]]
-        np.testing.assert_allclose(some.logits(step[[0, 2]]), expected, rtol=1e-5, atol=1e-5)
-
-
-@pytest.mark.parametrize("name", ["bytestream", "event_columns", "event_image", "finetuned"])
-def test_events_give_the_same_actions_as_the_observation_of_their_step(tmp_path, name):
-    folder = save(tmp_path, name)
-    windows = make_windows(np.random.default_rng(2), 30, side=SIDE)
-    spec = make_spec("event_image")
-    batch, single = load_policy(folder), load_policy(folder)
-    chosen, acted = [], []
-    for step, window in enumerate(windows):
-        events = step_events(window, 5000 * step)
-        shown = window
-        if name == "event_image":
-            shown = feature_of(spec).from_events(Step(events, 5000 * step, 5000), spec, None)
-        chosen.append(int(batch(shown[None])[0]))
-        acted.append(single.act(events, 5000 * step, 5000))
-    assert acted == chosen
-    assert len(set(chosen)) > 1
+def filtering(support, folder):
+    """A policy whose events pass a filter of such a support."""
+    spec = make_spec("event_columns")
+    about = {**ABOUT, "sensor": {**ABOUT["sensor"], "filter_support": support, "filter_tau_us": 1_000_000}}
+    return load_policy(save_policy(folder, build_networks(spec, seed=3), spec, about))
 
 
 def same_events(window):
     """The events of a window in every form whose meaning is plain."""
-    events = step_events(window, 0)
-    rows = np.stack([events[name].astype(np.int64) for name in "txyp"], axis=1)
+    rows = window[1 : window[0, 0] + 1].astype(np.int64)
+    events = np.array([tuple(row) for row in rows.tolist()], EVENT)
     fields = {name: events[name] for name in "txyp"}
     return {
         "array": events,
@@ -180,20 +140,20 @@ def same_events(window):
 
 @pytest.mark.parametrize("support", [0, 1])
 def test_events_may_come_in_every_form_whose_meaning_is_plain(support, tmp_path):
-    spec = make_spec("event_columns")
-    about = {**ABOUT, "sensor": {**ABOUT["sensor"], "filter_support": support, "filter_tau_us": 1_000_000}}
-    folder = save_policy(tmp_path, build_networks(spec, seed=3), spec, about)
+    policy = filtering(support, tmp_path)
+
+    def logits(events):
+        policy.reset()
+        return tuple(policy.event_logits(events, 0, 5000).tolist())
+
     (window,) = make_windows(np.random.default_rng(4), 1, side=SIDE)
-    found = {}
-    for name, events in same_events(window).items():
-        found[name] = load_policy(folder).event_logits(events, 0, 5000).tolist()
-    assert len(set(map(tuple, found.values()))) == 1, found
-    empty = [], np.empty((0, 4)), {name: [] for name in "txyp"}
-    none = [load_policy(folder).event_logits(events, 0, 5000).tolist() for events in empty]
-    assert none[0] == none[1] == none[2] != found["array"]
+    found = {name: logits(events) for name, events in same_events(window).items()}
+    assert len(set(found.values())) == 1, found
+    none = {logits(events) for events in ([], np.empty((0, 4)), {name: [] for name in "txyp"})}
+    assert len(none) == 1
+    assert found["array"] not in none
 
 
-@pytest.mark.parametrize("support", [0, 2])
 @pytest.mark.parametrize(
     ("events", "rule"),
     [
@@ -201,51 +161,35 @@ def test_events_may_come_in_every_form_whose_meaning_is_plain(support, tmp_path)
         ("events", "by name or as rows"),
         ([1, 2, 3, 1], "of shape \\(4,\\)"),
         ([[1, 2, 3, 1], [2, 2]], "by name or as rows"),
-        ([[1, 2, 3]], "of shape \\(1, 3\\)"),
         ([[1.5, 2, 3, 1]], "field t must hold integers, got float64"),
         ({"t": [1], "x": [1], "y": [1]}, "without p"),
         ({"t": [1, 2], "x": [1], "y": [1], "p": [1]}, "shapes"),
         ({"t": [True], "x": [1], "y": [1], "p": [1]}, "field t must hold integers, got bool"),
         ([[10, 2, 3, 0]], "event 0 has p=0: recode 0 as -1"),
-        ([[10, 2, 3, 2]], "event 0 has p=2"),
         ([[10, 2, 3, 1], [9, 2, 3, 1]], "in time order; event 1 has t=9 after 10: sort them"),
         ([[6000, 2, 3, 1]], r"t in \[0, 5000\] us; got 6000 to 6000: give start_us"),
         ([[10, -1, 3, 1]], "x=-1"),
         ([[10, 2, SIDE, 1]], f"y={SIDE}"),
     ],
 )
-def test_other_events_are_refused_by_one_rule(events, rule, support, tmp_path):
-    spec = make_spec("event_columns")
-    about = {**ABOUT, "sensor": {**ABOUT["sensor"], "filter_support": support, "filter_tau_us": 4000}}
-    policy = load_policy(save_policy(tmp_path, build_networks(spec, seed=3), spec, about))
+def test_other_events_are_refused_by_one_rule(events, rule, tmp_path):
     with pytest.raises(ValueError, match=f"event.*{rule}"):
-        policy.event_logits(events, 0, 5000)
+        filtering(0, tmp_path).event_logits(events, 0, 5000)
 
 
-def test_observations_may_be_lists_and_tensors(name, folder):
-    steps = make_observations(name, np.random.default_rng(1), 3)
-    found = []
-    for form in (np.asarray, torch.from_numpy, np.ndarray.tolist, list):
-        policy = load_policy(folder)
+@pytest.mark.parametrize("name", ["event_columns", "event_image", "rgb"])
+def test_observations_may_be_lists_and_tensors(name, tmp_path):
+    steps, policy = make_observations(name, 1, 3), load_policy(save(tmp_path, name))
+    forms = [np.asarray, torch.from_numpy, np.ndarray.tolist, list]
+    if name == "event_columns":
+        forms.append(lambda windows: [window[: window[0, 0] + 1] for window in windows])
+    else:
+        forms.append(lambda pictures: pictures[..., None])
+    found = set()
+    for form in forms:
         policy.reset(3)
-        found.append(policy.logits(form(steps)).tobytes())
-    assert len(set(found)) == 1
-    if name in ("event_image", "rgb"):
-        policy.reset(3)
-        assert policy.logits(steps[..., None]).tobytes() == found[0]
-
-
-def test_a_copy_goes_on_where_the_policy_was(name, folder):
-    steps = make_observations(name, np.random.default_rng(1), 12)
-    steps = steps.reshape(4, 3, *steps.shape[1:])
-    policy = load_policy(folder)
-    policy.reset(3)
-    for step in steps[:2]:
-        policy.logits(step)
-    copies = [copy.deepcopy(policy), pickle.loads(pickle.dumps(policy)), copy.copy(policy)]
-    expected = [policy.logits(step).tobytes() for step in steps[2:]]
-    for other in copies:
-        assert [other.logits(step).tobytes() for step in steps[2:]] == expected
+        found.add(policy.logits(form(steps)).tobytes())
+    assert len(found) == 1
 
 
 def test_a_policy_that_sees_no_events_says_so(tmp_path):
@@ -253,9 +197,13 @@ def test_a_policy_that_sees_no_events_says_so(tmp_path):
         load_policy(save(tmp_path, "rgb")).act(np.empty(0, EVENT), 0, 5000)
 
 
-def test_actions_are_int64_and_the_likeliest_ones(name, folder):
-    policy = load_policy(folder)
-    observations = make_observations(name, np.random.default_rng(3), 6)
+def test_actions_are_the_likeliest_one_for_each_episode(tmp_path):
+    policy, observations = (
+        load_policy(save(tmp_path, "event_columns")),
+        make_observations("event_columns", 3, 6),
+    )
+    with pytest.raises(ValueError, match=r"one for each of 1 episodes, got 6: call reset\(num_envs\)"):
+        policy(observations)
     policy.reset(6)
     actions = policy(observations)
     policy.reset(6)
@@ -275,11 +223,6 @@ def test_a_stochastic_policy_draws_actions_with_their_probabilities():
     np.testing.assert_allclose(shares, [0.2, 0.5, 0.3], atol=0.03)  # 4 standard errors
     with pytest.raises(ValueError, match="rng must be given"):
         Policy(networks, spec, deterministic=False)
-
-
-def test_a_number_of_observations_other_than_that_of_the_flights_is_refused(name, folder):
-    with pytest.raises(ValueError, match=r"one for each of 1 episodes, got 2: call reset\(num_envs\)"):
-        load_policy(folder)(make_observations(name, np.random.default_rng(6), 2))
 
 
 def test_an_encoder_is_saved_if_and_only_if_the_policy_has_one(tmp_path):
