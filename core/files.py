@@ -1,4 +1,4 @@
-"""Files that a reader finds whole or not at all."""
+"""Atomic file writes: complete or not at all."""
 
 import contextlib
 import os

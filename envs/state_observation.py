@@ -1,4 +1,4 @@
-"""A wrapper that shows what a vehicle measures of itself, velocity and last command, beside the events."""
+"""A wrapper that adds the vehicle's measured velocity and last command to the observation."""
 
 from typing import Any
 

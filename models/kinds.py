@@ -1,4 +1,4 @@
-"""Which kinds of policy there are, and the settings of each (appendix D.1.2).
+"""The kinds of policy, and the settings of each (appendix D.1.2).
 
     observation --feature, once per step--> stack of the last ones --network--> logits and value
 

@@ -1,4 +1,4 @@
-"""The cheapest way to the goal line from anywhere in a corridor, by dynamic programming on a lattice.
+"""The cheapest path to the goal from anywhere in a corridor, by dynamic programming on a lattice.
 
 The vehicle knows the geometry and moves on a lattice of `LATTICE_M` by steps ahead or 45 degrees to a side.
 Each place has a price, which falls with its clearance. The geometry is the scene's sections at the vehicle's

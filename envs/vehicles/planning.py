@@ -1,4 +1,4 @@
-"""The cheapest way of a vehicle with a body, by dynamic programming over place and velocity.
+"""The cheapest path of a vehicle with a body: dynamic programming over place and velocity.
 
 The plan assumes that the vehicle flies ahead at `EnvConfig.speed_mps` and accelerates left, right or not at
 all. Rows of the lattice are `ROW_S` of flight apart. For each row the cost-to-go is tabulated over x and over

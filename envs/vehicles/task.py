@@ -1,4 +1,4 @@
-"""Task: what a control step is worth, and what ends an episode.
+"""Task: reward of a control step, and end of an episode.
 
 `env.task` names a row of `envs.config.TASKS`. The default is "corridor", the paper's task: metres of progress
 along y, +100 at the goal line, -100 at a contact, and a time limit (appendix D.1.1). The compiled step judges

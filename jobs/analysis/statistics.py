@@ -1,4 +1,4 @@
-"""95 % intervals of a rate, of a mean, over several trainings, and of a difference on the same corridors.
+"""95 % intervals of rates and means, also over several trainings, and of paired differences.
 
 The unit of replication is the training. All trainings are evaluated in the same corridors, a crossed design
 of two random factors. scipy is used where possible; it has no interval of a mean over two crossed factors,

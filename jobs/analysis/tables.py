@@ -1,4 +1,4 @@
-"""Numbers with their intervals as text and as tables: Markdown for files, rich for a terminal."""
+"""Numbers with intervals, as text and as tables: Markdown for files, rich for a terminal."""
 
 import csv
 import io

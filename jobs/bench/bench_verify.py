@@ -1,4 +1,4 @@
-"""Check a result of the benchmark: it must agree with itself, and a random part must repeat to the byte.
+"""Check a benchmark result: it must be consistent, and a random part must repeat to the byte.
 
 Run: evade bench verify RESULT.json
 Expect: half a minute on two cores; the number of equal episodes, or the first that differs and exit status

@@ -1,4 +1,4 @@
-"""What exactness costs from end to end: for each setting of simulator and encoder, cost, errors and success.
+"""Measure what accuracy costs: time, errors and success for each setting of simulator and encoder.
 
 Run: python -m platform.launch +exp=trade
 Expect: an estimated hour on two idle cores. In the run folder under `trade/`, and in MLflow: tables, a plot,

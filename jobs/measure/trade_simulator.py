@@ -1,4 +1,4 @@
-"""What exact events cost: every knob of the simulator, its cost against its event error.
+"""Measure what exact events cost: time and event error of each simulator setting.
 
 Run: python -m platform.launch +exp=trade_simulator
 Expect: about a minute on one core. A table and a plot per scene, which mark the default and the settings that

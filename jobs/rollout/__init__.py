@@ -1,1 +1,1 @@
-"""Rolling out agents: policies, episodes, evaluation tasks, where they are stored and who computes them."""
+"""Rolling out agents: policies, episodes, evaluation tasks, their store and their executors."""

@@ -1,13 +1,14 @@
-"""Agents: the trained policy, and the baselines that say how hard the corridors are.
+"""Agents: trained policies, and the baselines that show how hard the corridors are.
 
-`straight` and `random` see nothing; `oracle` knows where everything stands. A result means
-something between them.
+The baselines `straight` and `random` see nothing, and `oracle` knows the true geometry. They are the lower
+and upper bounds to compare a result with.
 
 Policies may come from elsewhere. An ONNX file is one that `models.policy.onnx` wrote, or any network with
-one input, the event image (its values 0 to 255 in whatever type the input has), whose first output is a
-number for each action. A Python function is called with the seed at the start of each episode, and returns
-a function from an observation to an action, 0, 1 or 2; what an episode remembers lives in between. Its
-attribute `observation` says what it sees, as `EnvConfig.observation`; without one it sees the event image::
+one input, the event image (its values 0 to 255 in the input's own type), whose first output is a number
+for each action. A Python function is called with the seed at the start of each episode, and returns a
+function from an observation to an action, 0, 1 or 2, which may hold the memory of the episode. The outer
+function's attribute `observation` names its input, as `EnvConfig.observation`; the default is the event
+image::
 
     model = PPO.load("model.zip")
 
@@ -34,7 +35,7 @@ from envs.vehicles.planning import Planner
 if TYPE_CHECKING:
     from models.policy import Policy
 
-# Of one step in x and y, in step lengths: forward, left, right.
+# Displacements of one step in x and y [step lengths]: forward, left, right.
 MOVES = np.array([[0.0, 1.0], [-DIAGONAL, DIAGONAL], [DIAGONAL, DIAGONAL]])
 
 ONNX = ".onnx"
@@ -50,15 +51,15 @@ class Agent(Protocol):
     """Chooses an action for each episode of a batch.
 
     Attributes:
-        observation: What its environments must show, as `envs.config.EnvConfig` names it.
+        observation: The observation that it needs from its environments, as `EnvConfig.observation`.
     """
 
     @property
     def observation(self) -> Observation:
-        """Return what it sees."""
+        """Return the observation that it needs."""
 
     def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
-        """Begin one episode per environment, each just reset with its seed."""
+        """Start one episode per environment; each has just been reset with its seed."""
 
     def __call__(self, observations: np.ndarray) -> np.ndarray:
         """Return actions (B,) for observations (B, ...)."""
@@ -73,9 +74,9 @@ def make_agent(name: str, action: str = "deterministic", table: Sequence[tuple[s
     Args:
         name: "straight", "random", "oracle", the path of a policy folder or of an ONNX file, or
             "module:attribute", a function whose module is imported or can be.
-        action: "deterministic" or "stochastic": how a policy chooses.
+        action: How a policy chooses: "deterministic" or "stochastic".
         table: Names and values of settings of `EncoderTable.from_evae`, for a policy whose frozen
-            encoder reads single events; empty: those of the policy.
+            encoder reads single events; empty for the policy's own settings.
     """
     if name in BASELINES:
         return EpisodeAgent(BASELINES[name])
@@ -96,14 +97,14 @@ def make_agent(name: str, action: str = "deterministic", table: Sequence[tuple[s
 
 
 class EpisodeAgent:
-    """Chooses in each episode by itself; episodes side by side do not know of each other."""
+    """An agent that acts in each episode of a batch independently."""
 
     def __init__(self, begin: Callable[[CorridorEnv, int], Act], observation: Observation = "none") -> None:
-        """Take what begins an episode of an environment with a seed, and what it sees."""
+        """Call `begin(env, seed)` at the start of each episode for the function that chooses its actions."""
         self._begin, self.observation = begin, observation
 
     def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
-        """Begin an episode for each seed."""
+        """Start an episode for each seed."""
         self._acts = [self._begin(env, int(seed)) for env, seed in zip(envs, seeds, strict=True)]
 
     def __call__(self, observations: Any) -> np.ndarray:
@@ -111,7 +112,7 @@ class EpisodeAgent:
         return np.array([act(one) for act, one in zip(self._acts, observations, strict=True)])
 
     def keep(self, places: np.ndarray) -> None:
-        """Forget the other episodes."""
+        """Keep the running episodes (`Agent.keep`)."""
         self._acts = [self._acts[k] for k in places]
 
 
@@ -127,7 +128,10 @@ def fly_at_random(env: CorridorEnv, seed: int) -> Act:
 
 
 def fly_as_planned(env: CorridorEnv, seed: int) -> Act:
-    """Plan with the true geometry, for where the action takes effect; with a body by the cheapest command."""
+    """Plan with the true geometry from the place where the action takes effect.
+
+    A vehicle with a body, or among moving bodies, takes the command with the lowest cost (`Planner`).
+    """
     if env.dynamics.move is not None or env.moving:
         planner = Planner()
         return lambda observation: int(planner.costs(env).argmin())
@@ -137,10 +141,10 @@ def fly_as_planned(env: CorridorEnv, seed: int) -> Act:
 
 
 class PolicyAgent:
-    """A trained policy; it sees its observation alone.
+    """A trained policy, which gets nothing but its observation.
 
     Attributes:
-        logits: What it chose its last actions by, float64 (B, actions).
+        logits: The logits of its last actions, float64 (B, actions).
     """
 
     logits: np.ndarray
@@ -151,7 +155,7 @@ class PolicyAgent:
         self.observation = cast(Observation, policy.observation)
 
     def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
-        """Forget the episodes before.
+        """Start new episodes, with an empty memory.
 
         Raises:
             ValueError: The vehicle has another number of actions than the policy.
@@ -163,7 +167,7 @@ class PolicyAgent:
         self._envs, self._streams = list(envs), episode_streams(seeds)
 
     def __call__(self, observations: np.ndarray) -> np.ndarray:
-        """Return actions (B,); draws come from each episode's own stream."""
+        """Return actions (B,); random draws come from each episode's own stream."""
         if self.policy.spec.own_velocity:
             self.policy.velocity_mps = np.array([env.measured_velocity_mps for env in self._envs])
         self.logits = logits = self.policy.logits(observations).astype(np.float64)
@@ -174,13 +178,13 @@ class PolicyAgent:
         return self.policy.taken.copy()
 
     def keep(self, places: np.ndarray) -> None:
-        """Forget the other episodes."""
+        """Keep the running episodes (`Agent.keep`)."""
         self.policy.keep(places)
         self._envs, self._streams = ([kept[k] for k in places] for kept in (self._envs, self._streams))
 
 
 def function_agent(function: Callable[[int], Act]) -> EpisodeAgent:
-    """Return the agent of a Python function, as the top of this file describes it."""
+    """Return the agent of a Python function, which the module's docstring describes."""
 
     def begin(env: CorridorEnv, seed: int) -> Act:
         act = function(seed)
@@ -193,7 +197,7 @@ class OnnxAgent(EpisodeAgent):
     """An ONNX file, run by one thread of onnxruntime, one episode at a time."""
 
     def __init__(self, path: str, stochastic: bool) -> None:
-        """Load the file; actions are drawn from its logits, or are the likeliest."""
+        """Load the file; draw actions from its logits if `stochastic`, else take the likeliest."""
         import onnxruntime
 
         options = onnxruntime.SessionOptions()
@@ -207,7 +211,7 @@ class OnnxAgent(EpisodeAgent):
         super().__init__(self._episode, cast(Observation, sees))
 
     def _episode(self, env: CorridorEnv, seed: int) -> Act:
-        """Begin an episode, which remembers what the file asks for."""
+        """Start an episode that feeds the file's `next_*` outputs back into its `last_*` inputs."""
         (stream,) = episode_streams([seed])
         first = True
         memory = {name: _empty(one) for name, one in self._inputs.items() if name.startswith("last_")}
@@ -233,7 +237,7 @@ class OnnxAgent(EpisodeAgent):
         return act
 
     def _seen(self, observation: np.ndarray, first: bool) -> dict[str, Any]:
-        """Return an observation as the file takes it."""
+        """Return an observation as the file's inputs, name -> array."""
         if not self._own:
             ((name, one),) = self._inputs.items()
             shape = [size if isinstance(size, int) else 1 for size in one.shape]
@@ -252,7 +256,7 @@ def _empty(one: Any) -> np.ndarray:
 
 
 def num_actions(env: CorridorEnv) -> int:
-    """Return how many actions a vehicle has.
+    """Return the number of a vehicle's actions.
 
     Raises:
         ValueError: Its actions are not discrete.
@@ -264,7 +268,7 @@ def num_actions(env: CorridorEnv) -> int:
 
 
 def episode_streams(seeds: Sequence[int]) -> list[np.random.Generator]:
-    """Return one random stream per episode; it depends on the episode's seed alone."""
+    """Return one random stream per episode, which depends only on the episode's seed."""
     return [np.random.default_rng(np.random.SeedSequence([int(seed), 0x9110])) for seed in seeds]
 
 
@@ -279,9 +283,9 @@ def plan_path(scene: Scene, start_x_m: float, radius_m: float, height_m: float =
 
     Args:
         scene: The true geometry.
-        start_x_m: Where the episode starts, y = 0 [m].
-        radius_m: Of the vehicle [m].
-        height_m: Of the vehicle [m].
+        start_x_m: x where the episode starts, at y = 0 [m].
+        radius_m: Radius of the vehicle [m].
+        height_m: Height of the vehicle above the ground [m].
 
     Returns:
         x [m] at y = 0, LATTICE_M, 2 LATTICE_M, ... up to the goal line, float64.
@@ -296,7 +300,7 @@ def plan_path(scene: Scene, start_x_m: float, radius_m: float, height_m: float =
     return start_x_m + (np.array(path) - start) * LATTICE_M
 
 
-# Name -> what begins an episode.
+# Name -> function that starts an episode.
 BASELINES: dict[str, Callable[[CorridorEnv, int], Act]] = {
     "straight": fly_straight,
     "random": fly_at_random,

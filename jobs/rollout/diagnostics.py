@@ -1,11 +1,11 @@
-"""What a rollout can be trusted for: the event error of its simulation, and the drift of its encoder.
+"""Diagnostics of a rollout: the event error of its simulation, and the drift of the policy's encoder.
 
 A frozen event VAE was pretrained on other episodes than the policy's own. `drift` is the mean
-reconstruction error of a pixel over windows of one control step that the policy met, divided by the
-same error over the held-out windows of one control step of the encoder's own recording: 1 where the
-policy meets what the encoder knows, 1.2 where a pixel's error is a fifth larger. A picture with more
-events has a larger error too; `policy_explained_loss` and `policy_auc` say whether it is told from
-others as well as before.
+reconstruction error per pixel on event windows of the rollout, divided by the same error on held-out
+windows of the encoder's own recording; all windows last one control step. It is 1 if the encoder
+reconstructs both equally well, and 1.2 if the error in the rollout is a fifth larger. A picture with more
+events has a larger error too; `policy_explained_loss` and `policy_auc` show whether the reconstruction
+still follows the single window.
 """
 
 import statistics
@@ -31,8 +31,9 @@ MAX_WINDOWS = 512
 def report_event_error(config: EnvConfig) -> dict[str, float]:
     """Measure the event error of a simulation, print it, and return it as metrics.
 
-    A camera that follows the paper's two-frame difference is measured against one that
-    remembers, so its error is what that difference loses; the tolerance does not bind it.
+    The reference always keeps a level per pixel (`memory=reference`). For a camera that uses the paper's
+    two-frame difference, the error is therefore mostly that of the difference, which the tolerance does
+    not limit.
     """
     accuracy = measure_event_error(config)
     asked = config.fidelity.tolerance
@@ -49,27 +50,30 @@ def report_event_error(config: EnvConfig) -> dict[str, float]:
 
 
 class DriftSampler:
-    """Samples event windows during a rollout, to measure how well the policy's encoder knows them.
+    """Samples event windows during a rollout, to measure how well the policy's encoder reconstructs them.
 
-    All windows at first, later those of every second, fourth, ... step of each episode: at most
-    `MAX_WINDOWS`, the same steps of all episodes. For an agent without an encoder it samples nothing.
+    It starts with every step. Whenever it has more than `MAX_WINDOWS`, it drops every other sampled step, so
+    that it samples every second, fourth, ... step, the same steps in all episodes.
+
+    Attributes:
+        samples: Whether it samples at all; False for an agent without an encoder.
     """
 
     def __init__(self, agent: str | Path) -> None:
-        """Sample for the policy of a folder; a baseline's name stands for an agent without encoder."""
+        """Sample for the policy in the folder `agent`; a baseline's name samples nothing."""
         self._file = Path(agent) / ENCODER
-        self._sampling = self._file.is_file()
+        self.samples = self._file.is_file()
         self._every, self._steps = 1, Counter[int]()
         self._kept: list[tuple[int, np.ndarray]] = []
 
     @property
     def windows(self) -> list[np.ndarray]:
-        """Return the sampled windows, packed, in the order in which they were met."""
+        """Return the sampled windows, packed, in the order of sampling."""
         return [window for _, window in self._kept]
 
     def add(self, env: CorridorEnv, seed: int, observation: np.ndarray) -> None:
-        """Sample the window of a step, if it is its turn (`jobs.rollout.episodes.Watch`)."""
-        if not self._sampling:
+        """Sample the window of this step if the step is due (a `jobs.rollout.episodes.Watch`)."""
+        if not self.samples:
             return
         step = self._steps[seed]
         self._steps[seed] += 1
@@ -80,7 +84,7 @@ class DriftSampler:
             self._kept = [kept for kept in self._kept if kept[0] % self._every == 0]
 
     def metrics(self) -> dict[str, float]:
-        """Return the `drift_metrics` of the samples; empty without samples or without a decoder."""
+        """Return the `drift_metrics` of the samples; empty if there are no samples or no decoder."""
         if not self.windows:
             return {}
         evae, manifest = load_encoder(self._file)
@@ -92,17 +96,17 @@ class DriftSampler:
 def drift_metrics(
     evae: EventVAE, windows: Sequence[np.ndarray], held_out: Mapping[str, float]
 ) -> dict[str, float]:
-    """Return metrics of an event VAE on the windows that a policy met.
+    """Return metrics of an event VAE on windows from a policy's episodes.
 
     Args:
         evae: In eval mode.
         windows: Packed windows int32 (rows, 4), at least one.
-        held_out: The encoder's own metrics, of its manifest.
+        held_out: Held-out metrics from the encoder's manifest.
 
     Returns:
         `policy_reconstruction`, `policy_kl`, `policy_explained_loss` and `policy_auc` as
-        `models.encoder.evae.validate` defines them, and `drift` where the encoder's own error of one
-        control step is known. Empty for the target "proximity", which nobody knows of these windows.
+        `models.encoder.evae.validate` defines them, and `drift` if the manifest has the error of one
+        control step. Empty for the target "proximity": the true proximity of these windows is unknown.
     """
     if evae.target == "proximity":
         return {}
@@ -114,7 +118,7 @@ def drift_metrics(
 
 
 def mean_drift(trainings: Iterable[Mapping[str, float]]) -> dict[str, float]:
-    """Return the mean `drift_metrics` of trainings; those without an encoder are left out."""
+    """Return the mean `drift_metrics` of trainings, without the trainings that have no encoder."""
     measured = [metrics for metrics in trainings if metrics]
     names = dict.fromkeys(name for metrics in measured for name in metrics)
     return {

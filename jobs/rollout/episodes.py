@@ -1,10 +1,10 @@
-"""Episodes: one agent through one corridor each, several side by side, and what is recorded of them."""
+"""Episodes: roll out an agent through corridors in lock-step, and record results and trajectories."""
 
 import dataclasses
 from collections import defaultdict
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -27,10 +27,24 @@ EPISODE = np.dtype(
         ("dropped", "i8"),
     ]
 )
-# Columns that were added later -> what older episodes have in their place.
+# Columns that were added later -> default for older episodes.
 ADDED: dict[str, object] = {}
 # Called after each step with the environment, the seed and the observation.
 Watch = Callable[[CorridorEnv, int, np.ndarray], None]
+
+
+class Flight(NamedTuple):
+    """An episode to roll out.
+
+    Attributes:
+        config: The simulation; its observation is replaced by the one that the agent needs.
+        seed: Seed of the corridor.
+        watch: Called after each step.
+    """
+
+    config: EnvConfig
+    seed: int
+    watch: Watch | None = None
 
 
 def roll_out(
@@ -40,38 +54,53 @@ def roll_out(
     num_envs: int = 8,
     watch: Watch | None = None,
 ) -> np.ndarray:
-    """Roll out one episode per seed, several in lock-step so that the agent chooses in batches.
-
-    An episode depends on its seed, not on the others of its batch.
+    """Roll out one episode per seed, in batches.
 
     Args:
         agent: Chooses the actions.
-        config: The simulation; its observation is replaced by the one that the agent needs.
+        config: See `Flight`.
         seeds: One corridor each, shape (n,).
-        num_envs: How many episodes at once, at most.
+        num_envs: Most episodes of a batch.
         watch: Called after each step of each episode.
 
     Returns:
-        EPISODE (n,), in the order of the seeds. `distance_m` is the progress along y without
-        collision [m], `x_m` where across the corridor the episode ended [m], `dropped` the events
-        that neither pixel nor window could hold.
+        As `roll_out_together`.
     """
-    config = dataclasses.replace(config, observation=agent.observation)
-    parts = [np.empty(0, EPISODE)]
-    for first in range(0, len(seeds), num_envs):
-        batch = [int(seed) for seed in seeds[first : first + num_envs]]
-        env = CorridorVectorEnv(len(batch), config)
-        try:
-            parts.append(_roll_out_batch(agent, env, batch, watch))
-        finally:
-            env.close()
-    return np.concatenate(parts)
+    flights = [Flight(config, int(seed), watch) for seed in seeds]
+    batches = [flights[first : first + num_envs] for first in range(0, len(flights), num_envs)]
+    return np.concatenate([np.empty(0, EPISODE), *(roll_out_together(agent, batch) for batch in batches)])
 
 
-def _roll_out_batch(
-    agent: Agent, env: CorridorVectorEnv, seeds: Sequence[int], watch: Watch | None
-) -> np.ndarray:
-    """Roll out one episode per environment until the last ends; finished ones cost nothing more."""
+def roll_out_together(agent: Agent, flights: Sequence[Flight]) -> np.ndarray:
+    """Roll out episodes in lock-step, so that the agent chooses in batches.
+
+    Finished episodes take no more time. An episode depends only on its simulation and seed, not on the other
+    episodes of its batch.
+
+    Args:
+        agent: Chooses the actions.
+        flights: At least one; their observations have one shape, their vehicles the same actions.
+
+    Returns:
+        EPISODE (n,), in the order of the flights. `distance_m` is the progress along y without
+        collision [m], `x_m` the x at which the episode ended [m], `dropped` the number of events beyond
+        the limits of pixel and window.
+
+    Raises:
+        ValueError: The flights differ in their observations or actions; or as for `CorridorVectorEnv.step`.
+    """
+    configs = {id(flight.config): flight.config for flight in flights}  # each is validated once
+    seen = {key: dataclasses.replace(one, observation=agent.observation) for key, one in configs.items()}
+    env = CorridorVectorEnv(len(flights), [seen[id(flight.config)] for flight in flights])
+    try:
+        return _roll_out_batch(agent, env, flights)
+    finally:
+        env.close()
+
+
+def _roll_out_batch(agent: Agent, env: CorridorVectorEnv, flights: Sequence[Flight]) -> np.ndarray:
+    """Roll out one episode per environment until all have ended."""
+    seeds = [flight.seed for flight in flights]
     observations, _ = env.reset(seed=list(seeds))
     agent.reset(env.envs, seeds)
     totals = np.zeros((len(seeds), 4))
@@ -83,8 +112,9 @@ def _roll_out_batch(
         rewards, terminated, truncated = results
         ones = np.ones(running.size)
         totals[running] += np.stack((rewards, ones, infos["num_events"], infos["dropped_events"]), axis=1)
-        if watch is not None:
-            for row, observation in zip(running.tolist(), observations, strict=True):
+        for row, observation in zip(running.tolist(), observations, strict=True):
+            watch = flights[row].watch
+            if watch is not None:
                 watch(env.envs[row], seeds[row], observation)
         over = terminated | truncated
         if over.any():
@@ -97,12 +127,12 @@ def _roll_out_batch(
 
 
 def _those(observations: Any, places: np.ndarray) -> Any:
-    """Select some of a batch of observations, which is an array or a tuple."""
+    """Select observations from a batch, an array or a tuple, by their indices."""
     return tuple(observations[k] for k in places) if isinstance(observations, tuple) else observations[places]
 
 
 def _record(episode: np.void, totals: np.ndarray, truncated: bool, info: Info) -> None:
-    """Fill in an episode that has ended; `totals` are its return, steps, events and dropped events."""
+    """Fill in the EPISODE row of a finished episode; `totals`: return, steps, events, dropped events."""
     episode["success"], episode["collision"] = info["success"], info["collision"]
     episode["distance_m"], episode["x_m"] = info["distance_m"], info["x_m"]
     episode["truncated"] = truncated
@@ -112,15 +142,15 @@ def _record(episode: np.void, totals: np.ndarray, truncated: bool, info: Info) -
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Where one episode went.
+    """The path of one episode.
 
     Attributes:
-        agent: Who it was.
-        seed: Of the corridor.
+        agent: Name of the agent.
+        seed: Seed of the corridor.
         scene: The corridor.
         xy_m: Position after each control step, float64 (T, 2) [m].
         outcome: "goal", "collision" or "time limit".
-        height_m: Of the vehicle above the ground [m].
+        height_m: Height of the vehicle above the ground [m].
     """
 
     agent: str
@@ -142,7 +172,7 @@ class TrajectoryRecorder:
         self._height_m = 0.0
 
     def add(self, env: CorridorEnv, seed: int, observation: np.ndarray) -> None:
-        """Record the position of a step (`Watch`)."""
+        """Record the position after a step (a `Watch`)."""
         if seed in self.seeds:
             self._points[seed].append(env.camera_pose()[:2])
             self._scenes[seed] = env.scene
@@ -158,7 +188,7 @@ class TrajectoryRecorder:
 
 
 def outcome_of(episode: np.void) -> str:
-    """Return how an EPISODE () ended: "goal", "collision" or "time limit"."""
+    """Return the outcome of an EPISODE (): "goal", "collision" or "time limit"."""
     if episode["success"]:
         return "goal"
     return "collision" if episode["collision"] else "time limit"

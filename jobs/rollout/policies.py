@@ -1,4 +1,4 @@
-"""Policies by name: the folder that a name stands for, what it says, and its sensor in training."""
+"""Policies by name: find the folder of a name, read its manifest, apply its sensor settings."""
 
 import hashlib
 import os
@@ -25,7 +25,7 @@ from models.policy.policy import (
     read_policy_manifest,
 )
 
-SENSOR_KEYS = {path[-1]: key for key, path in ENV_KEYS.items() if path[0] != "faults"}  # by a setting's name
+SENSOR_KEYS = {path[-1]: key for key, path in ENV_KEYS.items() if path[0] != "faults"}  # setting -> its key
 FILTER = ("filter_support", "filter_tau_us")
 KINEMATIC: dict[str, Any] = {"vehicle": "kinematic", "body": {}}
 Differences = dict[str, tuple[object, object]]  # sensor setting -> (the policy's value, the environment's)
@@ -36,14 +36,14 @@ class EvaluatedPolicy:
     """A policy or a baseline that is evaluated.
 
     Attributes:
-        agent: Path of a policy folder, or a baseline's name.
-        group: What was trained; policies of one group differ in their training seed alone.
-        training: The training seed; None for a baseline.
+        agent: Path of a policy folder, or what else `make_agent` takes.
+        group: Name of the experiment; policies of one group differ only in their training seed.
+        training: The training seed; None for a baseline and a policy that was not trained here.
         identity: Hash of its manifest, which holds the SHA-256 sums of its files.
-        sensor: Sensor settings that it was trained with; none for a baseline.
-        observation: What it sees, as `envs.config.EnvConfig` names it.
-        world: Scene, layout and faults of its training; empty where its manifest does not say.
-        conditions: That its training drew, as `jobs.config.schema.TrainConfig` has them.
+        sensor: Sensor settings of its training; empty for a baseline and a policy that was not trained here.
+        observation: The observation that it needs, as `EnvConfig.observation`.
+        world: Scene, layout and faults of its training; empty if the manifest lacks them.
+        conditions: Conditions that its training drew from, as in `jobs.config.schema.TrainConfig`.
     """
 
     agent: str
@@ -62,10 +62,10 @@ class EvaluatedPolicy:
 
 
 def read_policy(agent: str) -> EvaluatedPolicy:
-    """Return what a policy folder says about itself; a baseline has only its name.
+    """Read a policy folder's manifest; a baseline has only its name.
 
     Raises:
-        ConfigError: If the folder's manifest is damaged, or lacks what tells one training from another.
+        ConfigError: If the manifest is damaged, or lacks the name, the seed or the sensor.
     """
     if agent in BASELINES:
         return EvaluatedPolicy(agent, agent, None, agent, {}, "none")
@@ -85,8 +85,8 @@ def read_policy(agent: str) -> EvaluatedPolicy:
         identity, observation = settings_hash(manifest), find_kind(manifest["name"]).observation
     except ValueError as error:
         raise ConfigError(f"policy: {agent!r}: {error}{needed_plugins(manifest)}") from None
-    # Policies of earlier versions name their conditions among the settings of their training, or have none:
-    # what they met is then their simulation as it is.
+    # Manifests of earlier versions have the conditions among the settings of their training, or have none:
+    # those policies were trained in the unchanged simulation.
     named = manifest.get("conditions") or manifest.get("train", {}).get("conditions")
     seed, sensor, world = int(manifest["seed"]), manifest["sensor"], manifest.get("world", {})
     return EvaluatedPolicy(agent, group, seed, identity, sensor, observation, world, named or [{}])
@@ -95,8 +95,8 @@ def read_policy(agent: str) -> EvaluatedPolicy:
 def read_foreign(name: str) -> EvaluatedPolicy:
     """Return a policy that was not trained here: an ONNX file, or a function "file.py:attribute".
 
-    In the place of a file there may be a package's folder, all of whose files go to the workers and into
-    the identity: weights, too.
+    A package's folder may replace the Python file. All its files, weights too, are sent to the workers and
+    hashed into the identity.
 
     Raises:
         ConfigError: There is no such file, module or attribute, or it cannot be loaded.
@@ -120,10 +120,10 @@ def read_foreign(name: str) -> EvaluatedPolicy:
 
 
 def find_policy(config: Config, run: Run) -> EvaluatedPolicy:
-    """Return the policy of a run folder, or else the newest one of its model.
+    """Return the policy of a run folder, or else the newest policy of its model in `runs_dir`.
 
     Raises:
-        ConfigError: If there is none; the message names the models that have one.
+        ConfigError: If there is none; the message names the models that have a trained policy.
     """
     if (run.policy / MANIFEST).is_file():
         return read_policy(str(run.policy))
@@ -141,14 +141,15 @@ def find_policies(
 ) -> list[EvaluatedPolicy]:
     """Return the policies and baselines that a name stands for.
 
-    A group of published policies, such as bytestream, stands for all its trainings: bytestream-s0, -s1, ..
+    The name of a group of published policies, such as bytestream, means all its trainings: bytestream-s0,
+    bytestream-s1, ...
 
     Args:
-        key: Where the configuration has the name, for messages.
+        key: Key of the name in the configuration, for messages.
         name: "pretrained", "newest", a baseline, a folder, or a name in `pretrained`.
-        config: The experiment.
+        config: Configuration of the experiment.
         run: Its run folder.
-        pretrained: The folder of the published policies.
+        pretrained: Folder of the published policies.
 
     Raises:
         ConfigError: If there is no such policy.
@@ -180,7 +181,7 @@ def find_one_policy(key: str, name: str, config: Config, run: Run) -> EvaluatedP
     """Return the one trained policy that a name stands for; arguments as `find_policies`.
 
     Raises:
-        ConfigError: If there is none; the message names the published ones.
+        ConfigError: If there is none; the message names the published policies.
     """
     published = sorted(path.parent.name for path in PRETRAINED.glob(f"*/{MANIFEST}"))
     if name != "newest" and name not in published and named_policy(name) is None:
@@ -195,7 +196,9 @@ def find_one_policy(key: str, name: str, config: Config, run: Run) -> EvaluatedP
 def find_study_policies(
     config: Config, run: Run, pretrained: Path = PRETRAINED
 ) -> tuple[EvaluatedPolicy, ...]:
-    """Return the policies that `study.policies` names, each once, groups together in the order of the names.
+    """Return the policies that `study.policies` names, without duplicates, sorted by group and seed.
+
+    Groups are in the order of the names.
 
     Raises:
         ConfigError: If there is no such policy, or two have the same group and training seed.
@@ -219,10 +222,10 @@ def find_study_policies(
 
 
 def load_trained(key: str, name: str, env: EnvConfig) -> tuple[Path, Policy]:
-    """Return the folder of the policy that a key of the configuration names, and the policy.
+    """Load the policy that a key of the configuration names; return its folder and the policy.
 
     Raises:
-        ConfigError: There is none, it is damaged, or it was trained with another sensor.
+        ConfigError: The policy is missing, is damaged, or was trained with another sensor.
     """
     path = named_policy(name)
     if path is None:
@@ -236,10 +239,10 @@ def load_trained(key: str, name: str, env: EnvConfig) -> tuple[Path, Policy]:
 
 
 def with_sensor(env: EnvConfig, sensor: Mapping[str, Any]) -> EnvConfig:
-    """Return the simulation with the sensor settings of a manifest, named as `sensor_settings` names them.
+    """Return the simulation with a manifest's sensor settings, which have the names of `sensor_settings`.
 
-    A manifest that names no vehicle is that of a kinematic one. Another vehicle than the configured one has
-    time for as long a way at its own speed.
+    If the manifest names no vehicle, it is the kinematic one. If the vehicle differs from the configured one,
+    the time limit is scaled so that the vehicle can cover the same distance at its own speed.
 
     Raises:
         pydantic.ValidationError: If a setting is unknown or its value is out of range.
@@ -254,7 +257,7 @@ def with_sensor(env: EnvConfig, sensor: Mapping[str, Any]) -> EnvConfig:
 def with_own_parts(policy: EvaluatedPolicy, env: EnvConfig) -> EnvConfig:
     """Return the simulation with a policy's neighbour filter and vehicle.
 
-    They belong to it as its networks do. If the simulation has that vehicle already, its body stays.
+    Both are parts of the policy. If the simulation already has the vehicle, its body stays unchanged.
     """
     own = {name: policy.sensor[name] for name in FILTER if name in policy.sensor}
     vehicle = {name: policy.sensor.get(name, usual) for name, usual in KINEMATIC.items()}
@@ -268,10 +271,10 @@ def own_sensor_differences(policy: EvaluatedPolicy, env: EnvConfig) -> Differenc
 
 
 def check_sensor(sensor: Mapping[str, Any], env: EnvConfig) -> None:
-    """Check that the environment has the sensor that a policy was trained with.
+    """Check that the environment has the sensor settings of a policy's training.
 
     Raises:
-        ValueError: If they differ; both values are named.
+        ValueError: If a setting differs; the message names both values.
     """
     differ = sensor_differences(dict(sensor), env)
     if differ:

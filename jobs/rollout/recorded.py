@@ -1,4 +1,4 @@
-"""One episode of a policy with all that it saw and chose, for films and pages."""
+"""One episode of a policy with its observations and actions, for films and pages."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -15,18 +15,18 @@ from jobs.rollout.episodes import roll_out
 
 
 class Moment(NamedTuple):
-    """One choice of a policy: what it saw before, and what it chose.
+    """One action of a policy, with the input that led to it.
 
     Attributes:
-        luminance: What the camera sees, float32 (H, W), linear.
+        luminance: The camera's image, float32 (H, W), linear.
         events: The last event of each pixel in this control step, as `envs.events.event_image` codes it,
             uint8 (H, W); None for a policy that sees no events.
         num_events: Events of this control step, faults included [-].
-        observation: What the policy was shown.
-        latent: What its encoder makes of it, float32 (L,); None for a policy without encoder.
-        probabilities: Of the actions, float64 (K,).
-        action: The one that was taken.
-        x_m, y_m: Where the vehicle is [m].
+        observation: The policy's observation.
+        latent: The encoder's latent of this observation, float32 (L,); None for a policy without encoder.
+        probabilities: Probabilities of the actions, float64 (K,).
+        action: The action taken.
+        x_m, y_m: Position of the vehicle [m].
         t_us: Simulated time [us].
     """
 
@@ -44,11 +44,11 @@ class Moment(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class RecordedEpisode:
-    """An episode, a moment for each of its steps, and the corridor that it went through.
+    """An episode with one moment per step.
 
     Attributes:
-        episode: EPISODE (), as an evaluation counts it.
-        moments: What was seen and chosen at each step.
+        episode: EPISODE (), the same as in an evaluation.
+        moments: Input and action of each step.
         scene: The corridor.
         env: The simulation.
     """
@@ -60,29 +60,29 @@ class RecordedEpisode:
 
 
 def record_episode(agent: PolicyAgent, env: EnvConfig, seed: int) -> RecordedEpisode:
-    """Roll out one episode, the same as without recording, in the corridor of a seed."""
+    """Roll out and record the episode of one seed; recording does not change the episode."""
     recorder = _Recorder(agent)
     (episode,) = roll_out(recorder, env, [seed], num_envs=1)
     return RecordedEpisode(episode, recorder.moments, recorder.env.scene, recorder.env.config)
 
 
 class _Recorder:
-    """An agent that chooses as another one does, and remembers why."""
+    """An agent that acts like another agent and records its moments."""
 
     def __init__(self, agent: PolicyAgent) -> None:
         self.agent, self.observation = agent, agent.observation
         self.moments: list[Moment] = []
 
     def reset(self, envs: Sequence[CorridorEnv], seeds: Sequence[int]) -> None:
-        """Begin one episode."""
+        """Start one episode."""
         (self.env,) = envs
         self.agent.reset(envs, seeds)
 
     def keep(self, places: np.ndarray) -> None:
-        """Return the one episode has ended."""
+        """Do nothing: the only episode has ended."""
 
     def __call__(self, observations: np.ndarray) -> np.ndarray:
-        """Return the agent's action (1,)."""
+        """Return the agent's action (1,), and record the moment."""
         actions, env = self.agent(observations), self.env
         info = env.info()
         encoder, (logits,) = self.agent.policy.encoder, self.agent.logits

@@ -1,6 +1,6 @@
-"""Evaluates tasks: splits what is missing into parts, hands these to an executor, stores each as it ends.
+"""Evaluate tasks: split their missing episodes into parts, and store each part that an executor returns.
 
-What is stored is never evaluated twice; what failed is tried again by the next run.
+Stored episodes are never evaluated again. The next run of the command retries failed ones.
 """
 
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from jobs.run.progress import progress
 
 
 class NothingEvaluatedError(RuntimeError):
-    """All tasks failed; the message says why in one line."""
+    """All tasks failed; the message gives one reason in one line."""
 
 
 def evaluate_tasks(
@@ -24,20 +24,20 @@ def evaluate_tasks(
     title: str = "Evaluate",
     measure_accuracy: bool = True,
 ) -> tuple[dict[str, TaskResult], dict[str, str]]:
-    """Evaluate what the store lacks, and return what it then holds.
+    """Evaluate the episodes that the store lacks, and return the results of all tasks.
 
     Args:
-        tasks: Of those that share a key the first is evaluated.
-        store: Where the episodes are kept.
+        tasks: If tasks share a key, only the first is evaluated.
+        store: Where the episodes are stored.
         executor: Computes the missing parts.
-        title: What the progress is called.
+        title: Label of the progress bar.
         measure_accuracy: Whether the accuracy of each simulation is measured too.
 
     Returns:
-        Key -> result of the tasks that could be evaluated, and key -> reason of the others.
+        Key -> result for the tasks that succeeded, and key -> reason for those that failed.
 
     Raises:
-        NothingEvaluatedError: If all failed.
+        NothingEvaluatedError: If all tasks failed.
     """
     unique: dict[str, EvaluationTask] = {}
     for task in tasks:
@@ -58,10 +58,10 @@ def evaluate_tasks(
 
 
 def plan_parts(tasks: Sequence[EvaluationTask], store: EpisodeStore, measure_accuracy: bool) -> list[Part]:
-    """Return the parts of tasks; the first of each simulation measures its accuracy, if it is to be known.
+    """Split tasks into parts; with `measure_accuracy`, the first part of each simulation measures it.
 
-    That of `renderer=spheres` is not: the ray caster takes minutes for hundreds of spheres, and is wrong
-    where they overlap.
+    The accuracy of `renderer=spheres` is never measured: the ray caster takes minutes for hundreds of
+    spheres, and is wrong where they overlap.
     """
     parts = [part for task in tasks for part in split(task)]
     if not measure_accuracy:
@@ -74,13 +74,14 @@ def plan_parts(tasks: Sequence[EvaluationTask], store: EpisodeStore, measure_acc
 
 
 def default_executor(cluster: ClusterConfig, folder: Path) -> Executor:
-    """Return Tune's executor where it pays: a handful of episodes is done before Ray has started.
+    """Return an executor that uses Tune, or only this process for at most `MAX_EPISODES` local episodes.
 
-    Pyrender always runs in a process of its own, because a failing driver can end it.
+    So few episodes take less time than the start of Ray. Pyrender always runs in a process of its own,
+    because a failing graphics driver can end the process.
 
     Args:
         cluster: Where Ray runs.
-        folder: The folder of a run folder where Tune keeps its state.
+        folder: Folder for Tune's state, in the run folder.
     """
 
     def execute(parts: Sequence[Part], recorder: Recorder) -> None:

@@ -1,4 +1,4 @@
-"""Where the episodes of evaluation tasks are kept, so that a stopped job continues from them."""
+"""The store of evaluated episodes, from which a stopped job resumes."""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -19,7 +19,7 @@ Stored = TypeVar("Stored")
 
 @dataclass(frozen=True)
 class SimulationAccuracy:
-    """How exact a simulation is: its event error [-], and the renders per control step that it takes."""
+    """Accuracy of a simulation: its event error [-], and its renders per control step."""
 
     event_error: float
     renders_per_step: float
@@ -27,12 +27,12 @@ class SimulationAccuracy:
 
 @dataclass(frozen=True)
 class PartResult:
-    """What came of a part of a task.
+    """The result of a part of a task.
 
     Attributes:
-        episodes: EPISODE of its seeds.
-        drift: `drift_metrics` of the policy's encoder; empty without one.
-        accuracy: Of its simulation, if it was measured.
+        episodes: EPISODE (n,), one row per seed.
+        drift: `drift_metrics` of the policy's encoder; empty without an encoder.
+        accuracy: Accuracy of the simulation; None if not measured.
     """
 
     episodes: np.ndarray
@@ -42,13 +42,13 @@ class PartResult:
 
 @dataclass(frozen=True)
 class TaskResult:
-    """What is stored of a task.
+    """The stored results of a task.
 
     Attributes:
-        episodes: EPISODE, by seed.
+        episodes: EPISODE (n,), sorted by seed.
         drift: `drift_metrics` of the policy's encoder in the part with the lowest seeds.
-        commits: Of the code that evaluated it, sorted.
-        restarts: How many processes ended before they had evaluated a part of it.
+        commits: Commits of the code that evaluated it, sorted.
+        restarts: Number of processes that ended before they had evaluated their part of it.
     """
 
     episodes: np.ndarray
@@ -60,27 +60,27 @@ class TaskResult:
 class EpisodeStore:
     """A folder with a JSON file for each task, and one for the accuracy of each simulation.
 
-    A damaged file is put aside, and its task is evaluated again.
+    A damaged file is renamed to `*.damaged`, and its task is evaluated again.
     """
 
     def __init__(self, folder: Path) -> None:
-        """Keep them in `folder`, which is made when the first is added."""
+        """Store in `folder`, which is created with the first result."""
         self.folder = folder
 
     def missing(self, task: EvaluationTask) -> EvaluationTask:
-        """Return the task with only those seeds whose episodes are not stored."""
+        """Return the task, limited to the seeds whose episodes are not stored."""
         stored = self._read(task.key)
         seeds = set() if stored is None else set(stored.episodes["seed"].tolist())
         return dataclasses.replace(task, seeds=tuple(seed for seed in task.seeds if seed not in seeds))
 
     def add(self, part: EvaluationTask, result: PartResult, commit: str, restarts: int = 0) -> None:
-        """Store the result of a part beside the episodes that its task has already.
+        """Store the result of a part, together with the stored episodes of its task.
 
         Args:
-            part: What was evaluated.
-            result: What came of it.
-            commit: Of the code that evaluated it.
-            restarts: How many processes ended since the last part of this task was stored.
+            part: The evaluated part.
+            result: Its result.
+            commit: Commit of the code that evaluated it.
+            restarts: Number of processes that ended since the last part of this task was stored.
         """
         before, new = self._read(part.key), result.episodes
         merged = TaskResult(new, result.drift, (commit,), restarts)
@@ -105,7 +105,7 @@ class EpisodeStore:
             write_json(self._accuracy_file(part), dataclasses.asdict(result.accuracy))
 
     def result(self, task: EvaluationTask) -> TaskResult:
-        """Return what is stored of a task, with the episodes of its seeds in their order.
+        """Return the stored results of a task, with one episode for each of its seeds, in their order.
 
         Raises:
             KeyError: If episodes are missing.
@@ -117,7 +117,7 @@ class EpisodeStore:
         return dataclasses.replace(stored, episodes=stored.episodes[[places[seed] for seed in task.seeds]])
 
     def accuracy(self, task: EvaluationTask) -> SimulationAccuracy | None:
-        """Return how exact a task's simulation is; None if that was not measured, or is damaged."""
+        """Return the accuracy of a task's simulation; None if it was not measured or its file is damaged."""
         file = self._accuracy_file(task)
         return self._undamaged(file, lambda values: SimulationAccuracy(**values))
 
@@ -128,7 +128,7 @@ class EpisodeStore:
         return self.folder / "accuracy" / f"{task.simulation}.json"
 
     def _read(self, key: str) -> TaskResult | None:
-        """Return all that is stored under a key; None if there is nothing, or if it is damaged."""
+        """Return all results stored under a key; None if there are none or the file is damaged."""
 
         def parse(values: Mapping[str, Any]) -> TaskResult:
             episodes = episodes_of(values["episodes"], values.get("columns", KEYED_COLUMNS))
@@ -137,7 +137,7 @@ class EpisodeStore:
         return self._undamaged(self._file(key), parse)
 
     def _undamaged(self, file: Path, parse: Callable[[Any], Stored]) -> Stored | None:
-        """Return what a file holds; None if there is none. A damaged one is put aside."""
+        """Read and parse a file; return None if it is missing, or damaged: it is then renamed."""
         if not file.is_file():
             return None
         try:

@@ -1,6 +1,6 @@
-"""The table of episodes: one row each, behind the labels that say whose it is and under which condition.
+"""The table of episodes: one row per episode, with labels for policy and condition in the first columns.
 
-A column that was added after a file was written gets its default, so that older files stay readable.
+If a file is older than a column, the column gets its default, so that older files stay readable.
 """
 
 import gzip
@@ -16,7 +16,7 @@ from jobs.rollout.episodes import ADDED, EPISODE
 from jobs.run.files import RunError, write_atomic
 
 COLUMNS: tuple[str, ...] = EPISODE.names or ()
-LABELS = ("Axis", "Value", "Group", "Training")  # of the episodes of a study
+LABELS = ("Axis", "Value", "Group", "Training")  # labels of a study's episodes
 WORDS: dict[str, Any] = {"Axis": str, "Value": str, "Group": str, "Training": "Int64"}
 
 
@@ -25,7 +25,7 @@ def as_table(labels: Sequence[str], episodes: Mapping[Any, np.ndarray]) -> pd.Da
 
     Args:
         labels: Headings of the labels.
-        episodes: Label -> EPISODE (n,).
+        episodes: Labels, one per heading -> EPISODE (n,).
     """
     parts = [
         pd.DataFrame({**dict(zip(labels, label, strict=True)), **{name: rows[name] for name in COLUMNS}})
@@ -35,7 +35,7 @@ def as_table(labels: Sequence[str], episodes: Mapping[Any, np.ndarray]) -> pd.Da
 
 
 def write_episodes(path: Path, labels: Sequence[str], episodes: Mapping[Any, np.ndarray]) -> None:
-    """Write all episodes as one table into a CSV file, packed for .gz; arguments as in `as_table`."""
+    """Write all episodes as one table into a CSV file, gzipped for .gz; arguments as in `as_table`."""
     text = io.StringIO()
     as_table(labels, episodes).to_csv(text, index=False, lineterminator="\n")
     whole = text.getvalue().encode()
@@ -43,7 +43,7 @@ def write_episodes(path: Path, labels: Sequence[str], episodes: Mapping[Any, np.
 
 
 def read_table(path: Path) -> pd.DataFrame:
-    """Read a table of a study's episodes, plain or packed (.gz); missing later columns get their defaults.
+    """Read a table of a study's episodes, plain or gzipped (.gz); missing later columns get their defaults.
 
     Raises:
         RunError: The file lacks a column that has no default.
@@ -53,7 +53,7 @@ def read_table(path: Path) -> pd.DataFrame:
 
 
 def _missing(path: Path, columns: Sequence[str]) -> dict[str, object]:
-    """Return the defaults of the columns that a file lacks."""
+    """Return the defaults of the columns that a file lacks; raise `RunError` if one has no default."""
     lacking = [name for name in COLUMNS if name not in columns]
     without = [name for name in lacking if name not in ADDED]
     if without:
@@ -62,7 +62,7 @@ def _missing(path: Path, columns: Sequence[str]) -> dict[str, object]:
 
 
 def episodes_of(rows: Sequence[Sequence[object]], columns: Sequence[str]) -> np.ndarray:
-    """Return rows of values under these columns as EPISODE (n,); missing later columns get their defaults.
+    """Convert rows of values of these columns to EPISODE (n,); missing later columns get their defaults.
 
     Raises:
         ValueError: A row has more or fewer values than there are columns.

@@ -1,4 +1,4 @@
-"""Evaluation tasks: one policy under one condition, through corridors that all policies share."""
+"""Evaluation tasks: one policy under one condition, in the same corridors for all policies."""
 
 import dataclasses
 import functools
@@ -10,13 +10,13 @@ import numpy as np
 from envs.config import EnvConfig, FaultsConfig, hashed_settings, seen_settings, settings_hash
 from jobs.rollout.policies import EvaluatedPolicy
 
-# Columns of EPISODE that count in the key of a task. Never extend it: a column that is added to EPISODE would
-# otherwise change every key, and every stored episode would be evaluated again.
+# Columns of EPISODE that are hashed into the key of a task. Never extend it, not even if EPISODE gets another
+# column: every key would change, and every stored episode would be evaluated again.
 KEYED_COLUMNS = (
     *("seed", "success", "collision", "truncated", "distance_m", "x_m", "return", "steps"),
     *("events_per_step", "dropped"),
 )
-MAX_EPISODES = 10  # of a part, in lock-step: more would leave other cores with nothing to do
+MAX_EPISODES = 10  # most episodes of a part, in lock-step; with more, other cores would idle
 
 
 @dataclass(frozen=True)
@@ -24,16 +24,15 @@ class EvaluationTask:
     """One policy or baseline under one condition.
 
     Attributes:
-        condition: Axis and value, or what else tells the conditions apart; several conditions share a
-            task where their settings are the same.
-        key: Hash of all that decides an episode but its seed: what the agent sees of the simulation,
-            the policy, the choice of action.
-        policy: What is evaluated.
+        condition: Axis and value, or another label; conditions with the same settings share a task.
+        key: Hash of everything that determines an episode except its seed: the settings of the simulation
+            that affect the agent, the policy, `action` and `table`.
+        policy: The policy or baseline.
         action: How a policy chooses: "deterministic" or "stochastic".
         env: The simulation.
         seeds: One corridor each.
-        table: Settings of `EncoderTable.from_evae` that the policy's encoder is tabulated with; empty:
-            the policy's own.
+        table: Settings of `EncoderTable.from_evae` for tabulating the policy's encoder; empty for the
+            policy's own settings.
     """
 
     condition: tuple[str, Any]
@@ -51,12 +50,12 @@ class EvaluationTask:
 
     @functools.cached_property
     def simulation(self) -> str:
-        """Return the hash of what decides how exact the events are: the simulation without its faults."""
+        """Return the hash of the settings that determine the event error: the simulation without faults."""
         return settings_hash(hashed_settings(dataclasses.replace(self.env, faults=FaultsConfig())))
 
     @property
     def part_id(self) -> tuple[str, int]:
-        """Return what tells the parts of a task apart: its key and the first seed."""
+        """Return the identity of a part of a task: its key and first seed."""
         return self.key, self.seeds[0]
 
 
@@ -68,7 +67,7 @@ def make_task(
     trials: int,
     table: tuple[tuple[str, Any], ...] = (),
 ) -> EvaluationTask:
-    """Return the task of the first `trials` corridors, see `EvaluationTask`, with its key."""
+    """Return a task in the first `trials` corridors, with its key; arguments as in `EvaluationTask`."""
     seen = seen_settings(env, policy.observation)
     facts: dict[str, object] = {
         "env": hashed_settings(seen),
@@ -81,7 +80,7 @@ def make_task(
 
 
 def text_of(value: object) -> str:
-    """Return a name or a value of a setting as text, different for every value."""
+    """Return a name or a setting's value as text; different numbers give different texts."""
     if not isinstance(value, int | float):
         return "null" if value is None else str(value)
     short = f"{value:g}"
@@ -89,6 +88,6 @@ def text_of(value: object) -> str:
 
 
 def split(task: EvaluationTask) -> list[EvaluationTask]:
-    """Return a task in parts of nearly the same size and at most `MAX_EPISODES`."""
+    """Split a task into parts of nearly equal size, of at most `MAX_EPISODES` episodes each."""
     parts = np.array_split(np.arange(len(task.seeds)), -(-len(task.seeds) // MAX_EPISODES))
     return [dataclasses.replace(task, seeds=task.seeds[part[0] : part[-1] + 1]) for part in parts]

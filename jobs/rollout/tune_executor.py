@@ -1,7 +1,8 @@
-"""Evaluates the parts of tasks side by side as trials of Ray Tune, one core each.
+"""Evaluate batches of parts in parallel, as trials of Ray Tune with one core each.
 
-A part whose process ends, or hangs longer than its limit, is tried `MAX_FAILURES` times more. Workers
-get the policies from the driver, so that other machines need not see its folders.
+If the process of a batch ends, or hangs longer than its limit, the batch is retried `MAX_FAILURES` times,
+and then each of its parts alone. Workers get the policies' files from the driver, so that other machines
+need no access to its folders.
 """
 
 import atexit
@@ -10,61 +11,100 @@ import math
 import shutil
 import tempfile
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import ray
 import torch
 from ray import tune
 from ray.tune.experiment import Trial
 
 from jobs.config.schema import ClusterConfig
 from jobs.rollout.agents import BASELINES
-from jobs.rollout.executors import Part, Recorder, attempt, evaluate_part
+from jobs.rollout.executors import Part, Recorder, evaluate_together
 from jobs.run.ray_cluster import fit, session_folder, start_ray, storage
 from jobs.run.trial_errors import low_memory, newest_error
 from jobs.run.variables import variables_set
 from jobs.run.watchdog import ending_after
 
 MAX_FAILURES = 2
-# A step takes a thousandth of this, with pyrender a tenth; compiling takes a minute, and several
-# on a busy machine.
+# A step takes a thousandth of this limit, or a tenth with pyrender. Compiling takes a minute, or several on
+# a busy machine.
 MAX_STEP_S, MAX_START_S = 0.1, 900.0
 UNKNOWN_END = "killed, often for lack of memory, or crashed"  # Ray cannot tell which
-# Stored episodes are what a stopped job continues from. Tune's own picture of all trials, written
-# at each result, would cost more than the episodes. A training of this process has another interval.
+# A stopped job resumes from the stored episodes, not from Tune's snapshot of all trials. A snapshot at each
+# result would cost more than the episodes. A training in this process has another interval.
 SNAPSHOTS = {"TUNE_GLOBAL_CHECKPOINT_S": "3600"}  # [s]
 
 Files = Mapping[str, Mapping[str, bytes]]  # policy folder -> name -> content
+Batch = tuple[Part, ...]
+BatchId = tuple[tuple[str, int], ...]
+MAX_ROWS = 32  # most episodes of a batch, in lock-step; more are hardly faster
+BATCHES_PER_CORE = 8  # at least; with fewer, cores would idle during the last batches
+
+
+def batches_of(parts: Sequence[Part], cores: int) -> list[Batch]:
+    """Group parts into batches that are rolled out in lock-step, starting with the parts of most steps.
+
+    Parts share a batch if they have the same policy and the same shapes of observations and actions. A batch
+    has at most `MAX_ROWS` episodes, and fewer if a core would otherwise get less than `BATCHES_PER_CORE`
+    batches. Each part of pyrender is a batch of its own, because pyrender can end its process.
+    """
+    most = min(MAX_ROWS, sum(len(part.task.seeds) for part in parts) // (BATCHES_PER_CORE * cores))
+    batches: dict[tuple[object, ...], list[list[Part]]] = defaultdict(list)
+    for part in sorted(parts, key=_most_steps, reverse=True):
+        own = batches[_shapes(part)]
+        rows = sum(len(other.task.seeds) for other in own[-1]) if own else most
+        if rows + len(part.task.seeds) > most:
+            own.append([])
+        own[-1].append(part)
+    return [tuple(batch) for some in batches.values() for batch in some]
+
+
+def _shapes(part: Part) -> tuple[object, ...]:
+    """Return the values that must be equal for all parts of a batch."""
+    task, env = part.task, part.task.env
+    alone = (part.task.part_id,) if env.renderer == "pyrender" else ()
+    seen = env.camera.width, env.camera.height, env.window_capacity, env.vehicle
+    return task.policy.agent, task.action, task.table, *seen, *alone
+
+
+def _most_steps(part: Part) -> float:
+    """Return the number of control steps until the time limit of a part's episodes."""
+    return part.task.env.time_limit_s * part.task.env.control_hz
 
 
 def run_with_tune(parts: Sequence[Part], recorder: Recorder, cluster: ClusterConfig, folder: Path) -> None:
-    """Evaluate parts as trials of Tune; starts or joins Ray.
+    """Evaluate parts as trials of Tune; start or join Ray.
 
     Args:
-        parts: One trial each.
-        recorder: Takes their results, in this process.
+        parts: Grouped here into batches (`batches_of`), one trial each.
+        recorder: Receives their results, in this process.
         cluster: Where Ray runs.
-        folder: The folder of a run folder where Tune keeps its state.
+        folder: Folder for Tune's state, in the run folder.
     """
     start_ray(cluster, folder.parent)
     trial = tune.with_parameters(run_trial, files=policy_files(parts))
     callback = TrialCallback(recorder)
     with variables_set(SNAPSHOTS):
-        while parts:
-            fit(_tuner(trial, parts, cluster, folder, callback))
-            parts = callback.take_unfinished()
+        batches = batches_of(parts, int(ray.cluster_resources().get("CPU", 1)))
+        while batches:
+            fit(_tuner(trial, batches, cluster, folder, callback))
+            batches = callback.take_unfinished()
 
 
 def _tuner(
-    trial: Any, parts: Sequence[Part], cluster: ClusterConfig, folder: Path, callback: "TrialCallback"
+    trial: Any, batches: Sequence[Batch], cluster: ClusterConfig, folder: Path, callback: "TrialCallback"
 ) -> tune.Tuner:
     return tune.Tuner(
         tune.with_resources(trial, {"cpu": 1}),
         tune_config=tune.TuneConfig(reuse_actors=True),  # a new worker imports for seconds
         param_space={
-            "trial": tune.grid_search([{"part": part, "limit_s": time_limit_s(part)} for part in parts])
+            "trial": tune.grid_search(
+                [{"batch": batch, "limit_s": sum(map(time_limit_s, batch))} for batch in batches]
+            )
         },
         run_config=tune.RunConfig(
             name="tune",
@@ -77,33 +117,32 @@ def _tuner(
 
 
 def time_limit_s(part: Part) -> float:
-    """Return how long a part may take before its process counts as hanging [s]."""
-    env = part.task.env
-    return MAX_START_S + len(part.task.seeds) * env.time_limit_s * env.control_hz * MAX_STEP_S
+    """Return the time after which a part's process counts as hanging [s]."""
+    return MAX_START_S + len(part.task.seeds) * _most_steps(part) * MAX_STEP_S
 
 
 def run_trial(params: Mapping[str, Any], files: Files) -> None:
-    """Evaluate one part in a Ray worker and report its result, or why it failed."""
+    """Evaluate a batch in a Ray worker; report the result of each part, or the reason why it failed."""
     torch.set_num_threads(1)
-    part: Part = params["trial"]["part"]
+    batch: Batch = params["trial"]["batch"]
     with ending_after(params["trial"]["limit_s"]):
-        outcome = attempt(lambda: evaluate_part(with_files(part, files)))
-    tune.report({"outcome": outcome})
+        outcomes = evaluate_together([with_files(part, files) for part in batch])
+    tune.report({"outcomes": outcomes})
 
 
 class TrialCallback(tune.Callback):
-    """Hands the results of trials to a recorder, and the ends of their processes."""
+    """Passes the results of trials, and the failures of their processes, to a recorder."""
 
     def __init__(self, recorder: Recorder | None) -> None:
-        """Hand them to `recorder`."""
+        """Pass results and failures to `recorder`; None in a pickled copy."""
         self._recorder = recorder
-        self._started: dict[tuple[str, int], float] = {}
-        self._ends: Counter[tuple[str, int]] = Counter()
-        self._late: set[tuple[str, int]] = set()
-        self._unfinished: list[Part] = []
+        self._started: dict[BatchId, float] = {}
+        self._ends: Counter[BatchId] = Counter()
+        self._late: set[BatchId] = set()
+        self._unfinished: list[Batch] = []
 
-    def take_unfinished(self) -> list[Part]:
-        """Return the parts that Tune gave up too early: it gives up trials that have not begun."""
+    def take_unfinished(self) -> list[Batch]:
+        """Return and clear the batches to retry: failed batches, or their single parts."""
         unfinished, self._unfinished = self._unfinished, []
         return unfinished
 
@@ -112,48 +151,61 @@ class TrialCallback(tune.Callback):
         return TrialCallback, (None,)
 
     def on_trial_start(self, iteration: int, trials: list[Trial], trial: Trial, **info: object) -> None:
-        """Note when a part begins, or begins again."""
-        self._started[_part_of(trial).task.part_id] = time.monotonic()
+        """Note the time at which a batch starts or restarts."""
+        self._started[_id_of(_batch_of(trial))] = time.monotonic()
 
     def on_trial_result(
         self, iteration: int, trials: list[Trial], trial: Trial, result: dict[str, Any], **info: object
     ) -> None:
-        """Hand over the outcome of a part."""
+        """Pass the outcomes of a batch to the recorder."""
         if self._recorder is not None:
-            self._recorder.finish(_part_of(trial), result["outcome"])
+            for part, outcome in zip(_batch_of(trial), result["outcomes"], strict=True):
+                self._recorder.finish(part, outcome)
 
     def on_trial_recover(self, iteration: int, trials: list[Trial], trial: Trial, **info: object) -> None:
-        """Note that a part is tried again."""
+        """Note that Tune retries a batch."""
         self._lose(trial, "tried again")
 
     def on_trial_error(self, iteration: int, trials: list[Trial], trial: Trial, **info: object) -> None:
-        """Note that a part is given up, unless its process has ended too seldom for that."""
-        part = _part_of(trial)
-        if self._ends[part.task.part_id] < MAX_FAILURES:
-            self._unfinished.append(part)
+        """Retry the batch if it had fewer than `MAX_FAILURES` failures before, else its parts one by one.
+
+        A single part is given up.
+        """
+        batch = _batch_of(trial)
+        if self._ends[_id_of(batch)] < MAX_FAILURES:
+            self._unfinished.append(batch)
             self._lose(trial, "tried again")
+        elif len(batch) > 1:
+            self._unfinished += [(part,) for part in batch]
+            self._lose(trial, "tried alone")
         else:
             self._lose(trial, "given up")
 
     def _lose(self, trial: Trial, consequence: str) -> None:
-        part = _part_of(trial)
-        name, limit_s = part.task.part_id, time_limit_s(part)
-        self._ends[name] += 1
-        if time.monotonic() - self._started.get(name, math.inf) >= limit_s:
-            self._late.add(name)
+        batch = _batch_of(trial)
+        own, limit_s = _id_of(batch), sum(map(time_limit_s, batch))
+        self._ends[own] += 1
+        if time.monotonic() - self._started.get(own, math.inf) >= limit_s:
+            self._late.add(own)
         cause = low_memory(newest_error(trial.error_file)) or UNKNOWN_END
-        if name in self._late:
+        if own in self._late:
             cause = f"it may take {limit_s:.0f} s"
         if self._recorder is not None:
-            self._recorder.lose(part, f"its process ended ({cause}) {self._ends[name]} times", consequence)
+            for part in batch:
+                reason = f"its process ended ({cause}) {self._ends[own]} times"
+                self._recorder.lose(part, reason, consequence)
 
 
-def _part_of(trial: Trial) -> Part:
-    return trial.config["trial"]["part"]
+def _batch_of(trial: Trial) -> Batch:
+    return trial.config["trial"]["batch"]
+
+
+def _id_of(batch: Batch) -> BatchId:
+    return tuple(part.task.part_id for part in batch)
 
 
 def policy_files(parts: Sequence[Part]) -> dict[str, dict[str, bytes]]:
-    """Return the files of every policy folder, for workers that may not see it."""
+    """Read the files of all policy folders, for workers without access to them."""
     folders = [Path(agent) for agent in {part.task.policy.agent for part in parts} - BASELINES.keys()]
     return {
         str(folder): {file.name: file.read_bytes() for file in folder.iterdir() if file.is_file()}
@@ -163,18 +215,18 @@ def policy_files(parts: Sequence[Part]) -> dict[str, dict[str, bytes]]:
 
 
 def with_files(part: Part, files: Files) -> Part:
-    """Return the part, its policy's folder, if it has one, replaced by one that this process has written."""
+    """Return the part with its policy's folder, if it has one, replaced by a copy written by this process."""
     policy = part.task.policy
     if policy.agent not in files:
         return part
     place = _unpacked.get(policy.identity)
     if place is None:
-        # A process that is killed leaves it behind: it goes with the logs then.
+        # A killed process leaves the folder behind; it is then removed with the logs.
         place = tempfile.mkdtemp(prefix="evade-policy-", dir=session_folder())
         atexit.register(shutil.rmtree, place, ignore_errors=True)
         for name, content in files[policy.agent].items():
             (Path(place) / name).write_bytes(content)
-        _unpacked[policy.identity] = place  # only when it is whole
+        _unpacked[policy.identity] = place  # only once all files are written
     task = dataclasses.replace(part.task, policy=dataclasses.replace(policy, agent=place))
     return dataclasses.replace(part, task=task)
 

@@ -1,4 +1,4 @@
-"""List the shipped policies: how each was trained, how large it is, how often it reaches the goal.
+"""List the shipped policies: training, size and success rate of each.
 
 Run: evade models
 Expect: tables in seconds; docs/models.md has the same, written by python -m docs.tables.

@@ -1,4 +1,4 @@
-"""The digits of this machine: a hash of what each stage of a training makes, beside the published ones.
+"""Compare this machine's results with the published ones: a hash for each stage of a training.
 
 Run: evade fingerprint
 Expect: half a minute on one core; "equal", or the first stage that differs and exit status 1. Later stages

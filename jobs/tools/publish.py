@@ -1,4 +1,4 @@
-"""Put trained policies where a fresh clone finds them, and draw their learning curves.
+"""Copy trained policies into models/pretrained, and draw their learning curves.
 
 Run: make train-all, which trains every policy and ends with this; or python -m platform.launch +exp=publish
 Expect: seconds. In models/pretrained a folder <group>-s<seed> for the newest training of each experiment,

@@ -1,4 +1,4 @@
-"""A policy looks at a real camera's recording: what it would have done at each control step, and how fast.
+"""Run a policy on a real camera's recording: its action at each control step, and its latency.
 
 Run: python -m platform.launch +exp=replay replay.recording=street.raw replay.policy=bytestream_hold-s0
 Expect: seconds. A line of numbers; `replay/choices.csv` and a film of the events and the choices in the run

@@ -1,4 +1,4 @@
-"""Check a file of spheres before anyone flies in it: what can be passed, and what the camera cannot draw.
+"""Check a file of spheres before a flight: whether it is passable, and what the camera cannot draw.
 
 Run: evade scene check FILE.csv
 Expect: seconds; a line for each height, for a point vehicle as in the DodgeDrone challenge, and for ours.

@@ -1,4 +1,4 @@
-"""Write the events that the configured camera would have seen of a video or a folder of images.
+"""Convert a video or a folder of images to the events that the configured camera would see.
 
 Run: python -m platform.launch +exp=video_events video_events.path=ride.mp4 camera=davis346 light=night
 Expect: seconds to minutes. A line of numbers and the file, with noise labels if the format supports them.

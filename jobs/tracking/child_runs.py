@@ -1,4 +1,4 @@
-"""Child runs in MLflow: finished runs of a sweep's conditions and groups, and of a trade's settings."""
+"""Child runs in MLflow: a study's conditions and groups, a search's trials, a trade's settings."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""Trained policies in MLflow's model registry: one name for each experiment, one version for each training.
+"""Trained policies in MLflow's model registry: one name per experiment, one version per training.
 
 A version is complete in itself: the policy folder (safetensors and JSON), the script `tracking.served_policy`
 and the packages `core` and `models`. Nothing is pickled, and nothing is installed to find its requirements.

@@ -1,4 +1,4 @@
-"""Runs in MLflow: their parameters, metrics, tags, files and pages.
+"""Runs in MLflow: parameters, metrics, tags, files and pages.
 
 One process creates the store (two at once break it). Only the driver writes, in batches: hundreds of
 single writes take seconds, a batch a few hundredths of one.

@@ -1,4 +1,4 @@
-"""The time of an event, as the network sees it: a bin of its window, and the code of that bin.
+"""The time of an event as network input: a bin of its window, and the code of that bin.
 
 Time is normalised by the fixed window, t = (t_us - start_us) / window_us in (0, 1], newest
 near 1 (appendix A.3), and then quantised to the centre of one of `time_bins` bins. The grid

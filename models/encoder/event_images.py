@@ -1,4 +1,4 @@
-"""Event images: how they are drawn from events, and an encoder of convolutions over them.
+"""Event images: drawing them from events, and a convolutional encoder for them.
 
 The policy `event_image_vae` (EIVAE in appendix D.1.2) uses this encoder, a variational
 autoencoder with the convolutions of `event_image`. Here each step's image is encoded on its own and

@@ -1,4 +1,4 @@
-"""An encoder that PPO trains on as part of a policy: rows of events in, latents of their windows out.
+"""An encoder that PPO finetunes as part of a policy: rows of events in, latents of their windows out.
 
 The feature of each step is its events, thinned to `EVENTS`. The trunk of the networks is the event
 context network followed by the layers that output the mean of the latent. Before the first update,

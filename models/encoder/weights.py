@@ -1,4 +1,4 @@
-"""Encoder files: tensors as safetensors, and beside them a JSON manifest that says what they are.
+"""Encoder files: tensors as safetensors, with a JSON manifest that describes them.
 
 `NAME.safetensors` holds the state of an `EventVAE`; `NAME.json` holds its settings ("model"),
 the SHA-256 of the tensors' file and whatever the writer adds, such as sensor settings, their

@@ -1,4 +1,4 @@
-"""A small network over a set of events, trained end to end: the rival of a frozen encoder.
+"""A small network over a set of events, trained end to end, without a frozen encoder.
 
 Similar to FLEET (Gottwald et al.): Fourier features of a pixel's position, a gate that depends on
 time, and pooling over the set. A window is thinned to at most `EVENTS` events, spread evenly over

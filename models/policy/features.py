@@ -1,4 +1,4 @@
-"""The features of a policy: what it keeps of one control step, an array of fixed size.
+"""The features of a policy: its input of one control step, as an array of fixed size.
 
 Each `Feature` defines its type and shape, and how to compute it from a batch of event windows or pictures.
 `models.kinds.KINDS` names the feature of each kind of policy.

@@ -1,4 +1,4 @@
-"""What a policy keeps of the past: its last features, or means of them that decay with time.
+"""The memory of a policy: its last features, or means of them that decay with time.
 
 Stored features are an array (B, depth, ...), the newest last. A stack holds the last features, regardless of
 the time between them. Decaying means, one for each time constant, encode duration independently of the

@@ -1,4 +1,4 @@
-"""What an agent can read from a representation of events: bearing and proximity of the obstacles ahead.
+"""Probe representations of events: how well they encode bearing and proximity of the obstacles ahead.
 
 Run: python -m platform.launch +exp=probe
 Expect: after the run's own encoder, 32 short trainings (an hour on one core) and their probes (a quarter

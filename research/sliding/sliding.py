@@ -1,4 +1,4 @@
-"""What a probe that is fitted in simulation reads of a real, sliding camera's events: the depth before it.
+"""Test a probe fitted in simulation on a real, sliding camera's events: read the depth ahead.
 
 Run: python -m platform.launch +exp=sliding sliding.folder=slider_depth camera=davis240_slider
 Expect: a minute or two; a table of correlations between read and true proximity, in simulation and for the

@@ -13,6 +13,7 @@ from tests.support.faults import (
     TASKS,
     check_ended_by_kernel,
     check_once,
+    check_second_refused,
     launch,
     noting,
     outcome,
@@ -26,11 +27,7 @@ def test_a_killed_driver_continues_by_the_printed_command(tmp_path):
     job = launch(tmp_path, *SEEING, after=noting(tmp_path))
     job.wait(lambda: len(job.kept()) >= 3)
     job.process.send_signal(signal.SIGSTOP)  # or a busy machine lets it end before the second one looks
-    refused = start(tmp_path, job.printed_command())
-    assert refused.end() == 1
-    who = f"{job.run}: process {job.process.pid} of "
-    assert who in refused.said
-    assert "works there; wait until it has ended" in refused.said
+    check_second_refused(tmp_path, job)
     job.kill_alone()
     before = job.kept()
     assert before
@@ -57,16 +54,17 @@ def test_ctrl_c_stops_a_sweep_that_the_same_command_continues(tmp_path):
 
 BROKEN = """
 import math, time
-whole = roll_out
-def roll_out(agent, config, seeds, *given, **named):
-    if config.faults.sparsity == 0.25:
+whole = roll_out_together
+def roll_out_together(agent, flights):
+    sparsity = {flight.config.faults.sparsity for flight in flights}
+    if 0.25 in sparsity:
         raise ZeroDivisionError("no")
-    if config.faults.sparsity == 0.5:
+    if 0.5 in sparsity:
         time.sleep(10**6)
-    if config.faults.sparsity == 0.9:
+    if 0.9 in sparsity:
         outgrow()
-    episodes = whole(agent, config, seeds, *given, **named)
-    if config.faults.sparsity == 0.75:
+    episodes = whole(agent, flights)
+    if 0.75 in sparsity:
         episodes["distance_m"][1] = math.nan
     return episodes
 """

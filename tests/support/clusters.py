@@ -13,8 +13,8 @@ AXIS = "+study.axes.rate={env.control_hz:[40,50,80,100,160,200]}"
 RATES = (*SWEEP, "~study.axes", AXIS, "study.policies=[straight,oracle]")
 SLOW = """
 import time
-whole = roll_out
-def roll_out(*given):
+whole = roll_out_together
+def roll_out_together(*given):
     time.sleep(4.0)
     return whole(*given)
 """

@@ -1,4 +1,4 @@
-"""The settings of the simulated camera with which it does what a recorded one did, as a file of conf/camera.
+"""Fit the settings of the simulated camera to a recording, and write them as a file of conf/camera.
 
 Run: python -m platform.launch +exp=calibrate calibrate.recording=events.txt calibrate.frames=images.txt
 Expect: seconds to minutes. A table of settings with their intervals; the file `calibrate/camera.yaml` and the

@@ -1,4 +1,4 @@
-"""Search for settings that a training learns best with (Optuna's TPE; ASHA: Li et al. 2020).
+"""Search for the best settings of a training (Optuna's TPE; ASHA: Li et al. 2020).
 
 Run: python -m platform.launch +exp=search model=event_columns
 Expect: each trial is a training on one core; trials run in parallel on all cores. In the run folder under

@@ -29,17 +29,15 @@ def evae(request):
 
 
 def test_drift_metrics_are_those_of_the_windows_and_drift_is_the_ratio_to_the_encoders_own(evae):
-    windows = np.stack([window(50 * n, n) for n in range(6)])
+    windows, state = np.stack([window(50 * n, n) for n in range(6)]), torch.get_rng_state()
     batch = batch_packed(windows, evae.grid)
     expected = validate(evae, batch, event_targets(batch, "occupancy"))
     metrics = drift_metrics(evae, windows, {"reconstruction_step": 0.25})
     assert set(metrics) == set(DRIFT_METRICS)
-    assert metrics["policy_auc"] == expected["auc"]
-    assert metrics["policy_kl"] == expected["kl"]
+    assert (metrics["policy_auc"], metrics["policy_kl"]) == (expected["auc"], expected["kl"])
     assert metrics["drift"] == pytest.approx(4 * expected["reconstruction"])
-    at_home = drift_metrics(evae, windows, {"reconstruction_step": expected["reconstruction"]})
-    assert at_home["drift"] == 1.0
     assert set(drift_metrics(evae, windows, {})) == set(DRIFT_METRICS) - {"drift"}
+    assert torch.equal(torch.get_rng_state(), state), "a measurement takes no random number"
 
 
 def test_windows_without_events_have_metrics_too(evae):
@@ -48,7 +46,7 @@ def test_windows_without_events_have_metrics_too(evae):
     assert (metrics["policy_auc"], metrics["policy_explained_loss"]) == (0.5, 0.0)
 
 
-@pytest.mark.parametrize("episodes", [1, 2, 3, 7, 8, 9, 10])
+@pytest.mark.parametrize("episodes", [1, 3, 10])
 def test_the_windows_kept_are_few_and_from_all_over_all_episodes(tmp_path, episodes):
     sampler = DriftSampler(save_untrained(tmp_path / "policy"))
     for step in range(2_000):
@@ -69,33 +67,20 @@ def test_a_policy_is_measured_by_the_encoder_of_its_folder_on_what_it_saw(tmp_pa
     source = save_untrained(tmp_path / "policy")
     evae, about = load_encoder(source / ENCODER)
     sampler, seen = DriftSampler(source), []
-    config = EnvConfig(time_limit_s=0.1, split="eval")
-    agent = make_agent(str(source))
+    config, agent = EnvConfig(time_limit_s=0.1, split="eval"), make_agent(str(source))
     roll_out(agent, config, [0, 1], watch=lambda *step: (sampler.add(*step), seen.append(step[2].copy())))
-    metrics = drift_metrics(evae, seen, {"reconstruction_step": 0.5})
-    assert sampler.metrics() == pytest.approx(metrics, rel=1e-5)
-    assert about["figures"] == {"reconstruction_step": 0.5}
+    assert sampler.metrics() == pytest.approx(drift_metrics(evae, seen, about["figures"]), rel=1e-5)
 
 
-@pytest.mark.parametrize("name", ["event_image", "event_columns"])
-def test_an_agent_without_an_event_vae_has_no_drift(tmp_path, name):
-    for agent in (save_untrained(tmp_path / name, name=name), "straight"):
+def test_an_agent_without_an_event_vae_or_with_one_for_what_a_simulator_knows_has_no_drift(tmp_path):
+    for agent in (save_untrained(tmp_path / "policy", name="event_columns"), "straight"):
         sampler = DriftSampler(agent)
         roll_out(make_agent(str(agent)), EnvConfig(time_limit_s=0.05), [0], watch=sampler.add)
         assert sampler.metrics() == {}
         assert sampler.windows == []
-
-
-def test_a_measurement_takes_no_random_number(evae):
-    state = torch.get_rng_state()
-    drift_metrics(evae, [window(20)], {})
-    assert torch.equal(torch.get_rng_state(), state)
+    near = EventVAE(context=16, target="proximity").freeze()
+    assert drift_metrics(near, [window(50)], {"reconstruction_step": 0.25}) == {}
 
 
 def test_the_drift_of_a_group_is_the_mean_of_the_trainings_that_have_an_encoder():
     assert mean_drift([{"drift": 1.0}, {"drift": 2.0}, {}]) == {"evae/drift": pytest.approx(1.5)}
-
-
-def test_what_only_a_simulator_knows_has_no_drift():
-    near = EventVAE(context=16, target="proximity").freeze()
-    assert drift_metrics(near, [window(50)], {"reconstruction_step": 0.25}) == {}

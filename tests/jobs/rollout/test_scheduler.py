@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from jobs.rollout import scheduler
-from jobs.rollout.executors import evaluate_part, run_serially
+from jobs.rollout.episodes import roll_out_together
+from jobs.rollout.executors import evaluate_part, evaluate_together, run_serially
 from jobs.rollout.scheduler import NothingEvaluatedError, default_executor, evaluate_tasks, plan_parts
 from jobs.rollout.store import EpisodeStore
 from tests.support.configs import AXES, sweep_config
@@ -25,35 +26,6 @@ def executor():
     return FakeExecutor()
 
 
-def test_a_second_run_evaluates_nothing_twice(tmp_path, store, executor):
-    tasks = planned(sweep_config(tmp_path, axes=SEEN), "straight", "oracle").tasks
-    first, failed = evaluate_tasks(tasks, store, executor)
-    assert len(executor.evaluated) == len(set(executor.evaluated)) == 12
-    assert not failed
-    again, _ = evaluate_tasks(tasks, store, executor)
-    assert len(executor.evaluated) == 12
-    for key, result in first.items():
-        np.testing.assert_array_equal(result.episodes, again[key].episodes)
-
-
-def test_more_trials_evaluate_only_the_new_corridors(tmp_path, store, executor):
-    few, many = (planned(sweep_config(tmp_path, trials=trials), "straight").tasks for trials in (2, 5))
-    evaluate_tasks(few, store, executor)
-    executor.evaluated.clear()
-    results, _ = evaluate_tasks(many, store, executor)
-    assert sorted({seed for _, seed in executor.evaluated}) == [2, 3, 4]
-    assert all(list(result.episodes["seed"]) == [0, 1, 2, 3, 4] for result in results.values())
-
-
-def test_a_sweep_that_was_stopped_evaluates_what_is_missing(tmp_path, store, executor):
-    tasks = planned(sweep_config(tmp_path), "straight").tasks
-    evaluate_tasks(tasks, store, executor)
-    (store.folder / "episodes" / f"{tasks[2].key}.json").unlink()
-    executor.evaluated.clear()
-    evaluate_tasks(tasks, store, executor)
-    assert executor.evaluated == [(tasks[2].key, 0), (tasks[2].key, 1)]
-
-
 def test_each_simulation_is_measured_once_whatever_is_evaluated_in_it(tmp_path, store, executor):
     tasks = planned(sweep_config(tmp_path), "straight", "oracle").tasks
     evaluate_tasks(tasks, store, executor)
@@ -70,39 +42,29 @@ def test_of_spheres_no_accuracy_is_measured(tmp_path, store):
         assert part.measures_accuracy == (renderer == "raycast")
 
 
-def test_what_raises_or_dies_stops_no_other_and_is_evaluated_by_the_next_run(tmp_path, store, executor):
-    tasks = planned(sweep_config(tmp_path, axes=SEEN), "straight").tasks
-    keys = {task.condition: task.key for task in tasks}
+def test_runs_in_which_some_raise_or_die_lead_to_the_results_of_one_run_and_evaluate_nothing_twice(
+    tmp_path, store, executor
+):
+    few, many = (
+        planned(sweep_config(tmp_path, trials=trials, axes=SEEN), "straight").tasks for trials in (2, 24)
+    )
+    keys = {task.condition: task.key for task in many}
     raised, died = ("speed", 10), ("rate", 100)
     executor.broken = {raised: "ValueError: no", died: ""}
-    results, failed = evaluate_tasks(tasks, store, executor)
+    results, failed = evaluate_tasks(few, store, executor)
     assert failed == {keys[raised]: "ValueError: no", keys[died]: "its process ended 3 times"}
     assert set(results) == {keys["speed", 20]}
-    executor.broken = {}
-    executor.evaluated.clear()
-    assert evaluate_tasks(tasks, store, executor)[1] == {}
-    assert {key for key, _ in executor.evaluated} == {keys[raised], keys[died]}
-
-
-def test_a_sweep_of_which_everything_fails_stops_with_the_reason(tmp_path, store, executor):
-    tasks = planned(sweep_config(tmp_path), "straight").tasks
-    executor.broken = {task.condition: "ValueError: no" for task in tasks}
-    with pytest.raises(NothingEvaluatedError, match=r": ValueError: no; "):
-        evaluate_tasks(tasks, store, executor)
-
-
-def test_a_task_of_which_a_part_dies_keeps_the_others_and_tries_that_part_again(tmp_path, store, executor):
-    tasks = planned(sweep_config(tmp_path, trials=24), "straight").tasks[:1]
-    executor.dying = {(tasks[0].key, 8)}
-    with pytest.raises(NothingEvaluatedError, match="its process ended 3 times"):
-        evaluate_tasks(tasks, store, executor)
-    assert {seed for _, seed in executor.evaluated} == {*range(8), *range(16, 24)}
+    executor.broken, executor.dying = {}, {(keys[raised], 8)}  # one of three parts
+    assert evaluate_tasks(many, store, executor)[1] == {keys[raised]: "its process ended 3 times"}
     executor.dying = set()
-    executor.evaluated.clear()
-    (result,) = evaluate_tasks(tasks, store, executor)[0].values()
-    assert sorted(seed for _, seed in executor.evaluated) == list(range(8, 16))
-    assert list(result.episodes["seed"]) == list(range(24))
-    assert result.restarts == 1
+    results, failed = evaluate_tasks(many, store, executor)
+    assert not failed
+    assert results[keys[raised]].restarts == 1
+    assert len(executor.evaluated) == len(set(executor.evaluated)) == 3 * 24
+    once, _ = evaluate_tasks(many, EpisodeStore(tmp_path / "once"), FakeExecutor())
+    for key, result in once.items():
+        assert list(result.episodes["seed"]) == list(range(24))
+        np.testing.assert_array_equal(result.episodes, results[key].episodes)
 
 
 def test_a_policy_is_evaluated_alone_and_the_accuracy_measured_where_asked(tmp_path, store):
@@ -120,22 +82,51 @@ def test_a_policy_is_evaluated_alone_and_the_accuracy_measured_where_asked(tmp_p
     assert store.accuracy(task) == first.accuracy
 
 
-def test_an_evaluation_that_raises_in_this_process_is_reported_with_its_error(tmp_path, store, monkeypatch):
-    monkeypatch.setattr("jobs.rollout.executors.roll_out", lambda *given: {}["no\nsuch"])
+def test_parts_in_one_batch_have_the_results_of_each_alone(tmp_path, store, monkeypatch):
+    faults = {"faults.sparsity": [0.2], "faults.background_activity": [0.3]}
+    axes = SEEN | {
+        "late": {"env.action_delay_ms": [25]},
+        "faults": faults,
+        "long": {"env.time_limit_s": [0.3]},
+    }
+    config = sweep_config(tmp_path, axes=axes)
+    path = save_training(tmp_path / "policy", "a", 0, config.env)
+    parts = plan_parts(planned(config, path).tasks, store, False)
+    alone, together = [evaluate_part(part) for part in parts], evaluate_together(parts)
+    assert len({result.episodes["steps"][0] for result in alone}) > 2  # they end one after the other
+    for own, shared in zip(alone, together, strict=True):
+        assert shared.episodes.tobytes() == own.episodes.tobytes()
+        assert shared.drift == own.drift
+    monkeypatch.setattr("jobs.rollout.executors.roll_out_together", without_faults)
+    failing = evaluate_together(parts)
+    assert [isinstance(result, str) for result in failing] == [
+        part.task.env.faults.sparsity > 0 for part in parts
+    ]
+
+
+def without_faults(agent, flights):
+    if any(flight.config.faults.sparsity for flight in flights):
+        raise ValueError("no")
+    return roll_out_together(agent, flights)
+
+
+def test_a_sweep_of_which_every_evaluation_raises_stops_with_the_reason(tmp_path, store, monkeypatch):
+    monkeypatch.setattr("jobs.rollout.executors.roll_out_together", lambda *given: {}["no\nsuch"])
     tasks = planned(sweep_config(tmp_path), "straight").tasks
     with pytest.raises(NothingEvaluatedError, match=r"KeyError: 'no.*such'"):
         evaluate_tasks(tasks, store, run_serially)
 
 
-@pytest.mark.parametrize(
-    ("trials", "axes", "cluster", "here"),
-    [
-        (2, AXES, "local", True),
-        (2, AXES, "ray", False),
-        (6, AXES, "local", False),
-        (2, {"renderer": {"renderer": ["raycast", "pyrender"]}}, "local", False),
-    ],
-)
+DRAWN = {"renderer": {"renderer": ["raycast", "pyrender"]}}
+FEW = [
+    (2, AXES, "local", True),
+    (2, AXES, "ray", False),
+    (6, AXES, "local", False),
+    (2, DRAWN, "local", False),
+]
+
+
+@pytest.mark.parametrize(("trials", "axes", "cluster", "here"), FEW)
 def test_a_handful_of_episodes_does_without_ray(tmp_path, store, monkeypatch, trials, axes, cluster, here):
     config = sweep_config(tmp_path, trials=trials, axes=axes)
     used = []
