@@ -185,5 +185,5 @@ lock: $(DEVELOPING) ## update requirements.lock and requirements-dev.lock (ARGS=
 	mv $(VENV)/lock requirements-dev.lock
 
 clean: ## remove caches and build files; .venv, runs and results stay
-	rm -rf build dist *.egg-info .benchmarks .hypothesis .import_linter_cache .mypy_cache .pytest_cache .ruff_cache
+	rm -rf build dist *.egg-info .hypothesis .import_linter_cache .mypy_cache .pytest_cache .ruff_cache
 	find . -name __pycache__ -not -path './.venv*' -prune -exec rm -rf {} +

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numba.core import event
 
-NOT_QUICK = ("system", "slow", "benchmark", "faults", "cluster")
+NOT_QUICK = ("system", "slow", "faults", "cluster")
 LISTED = 10
 REPEATS = 3  # of the unit, of which the quickest counts
 AGAIN_S = 60.0  # after that the unit is measured again: a processor's speed changes while a suite runs

@@ -1,6 +1,5 @@
 import importlib
 import sys
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +14,6 @@ from jobs.config.config import ConfigError, as_dict, parse
 from jobs.config.env_keys import env_with
 from jobs.run.folder import run_name
 from jobs.study.met import met
-from models.kinds import DenseModel, Kind
 from tests.support.configs import compose, small_config
 
 HEAD = "from envs.config import ADDED_FAULTS\nfrom envs.scene.layouts import LAYOUTS, Layout, MeshLayout\n"
@@ -59,7 +57,7 @@ def test_a_file_a_package_and_a_module_add_what_every_job_finds_by_name(write, t
     path = write(HEAD + LOSE + GROVE, name)
     monkeypatch.syspath_prepend(str(tmp_path)) if form == "module" else None
     named = {"file": path, "folder": str(tmp_path / "own_plugin"), "module": "own_plugin"}[form]
-    values = compose("+exp=train", "env.scene=grove", "+faults.added.lose=0.5")
+    values = compose(*VALUES)
     with pytest.raises(ConfigError, match=r"faults\.added.*a plug-in, and none is loaded, got 'lose'"):
         parse(values)
     for _ in range(2):  # a second configuration of the same process
@@ -80,6 +78,9 @@ def test_a_mesh_beside_its_package_is_the_scene_of_its_path(write, tmp_path):
     assert named.width_m == by_path.width_m == 40
 
 
+VALUES = ("+exp=train", "env.scene=grove", "+faults.added.lose=0.5")
+
+
 @pytest.fixture
 def install(write, tmp_path, monkeypatch):
     """Install a distribution with one module and its entry points, as pip leaves it on disk."""
@@ -97,11 +98,9 @@ def install(write, tmp_path, monkeypatch):
 
 def test_an_installed_package_is_named_by_its_entry_point(install, tmp_path):
     install("own_dist", "own_module", HEAD + LOSE + GROVE, groves="own_module")
-    values = compose("+exp=train", "env.scene=grove", "+faults.added.lose=0.5")
     runs = set()
     for name in ("groves", "own_module", str(tmp_path / "own_module.py")):  # all the same plug-in
-        config = parse({**values, "plugins": [name]})
-        assert config.env.faults.added == {"lose": 0.5}
+        config = parse({**compose(*VALUES), "plugins": [name]})
         runs.add(run_name(config))
         assert list(plugins.plugin_digests()) == ["own_module"]
     assert len(runs) == 1
@@ -154,6 +153,7 @@ REFUSED = {
         "its scene 'wall': layout",
     ),
     "no function": (HEAD + "ADDED_FAULTS['lose'] = 0.5\n", "its fault 'lose': must be a function, got 0.5"),
+    "no kind": (ADDS + "KINDS['blind'] = 7\n", "its kind of policy 'blind': 'int' object has no attribute"),
     "no such feature": (
         ADDS + "KINDS['blind'] = Kind('window', 'own_plugin:NONE', 'own_plugin:NONE', DenseModel)\n",
         "its kind of policy 'blind': module 'own_plugin' has no attribute 'NONE'",
@@ -210,17 +210,11 @@ WRONG = {
 
 @pytest.mark.parametrize("code", WRONG)
 def test_what_a_fault_returns_is_checked(write, code):
-    path = write(
-        HEAD
-        + "import numpy as np\n"
-        + f"ADDED_FAULTS['wrong'] = lambda *made: lambda events, t0, t1: {code}\n"
-    )
-    plugins.load_plugins([path])
+    wrong = f"ADDED_FAULTS['wrong'] = lambda *made: lambda events, t0, t1: {code}\n"
+    plugins.load_plugins([write(HEAD + "import numpy as np\n" + wrong)])
     env = CorridorEnv(EnvConfig(faults=FaultsConfig(added={"wrong": 1.0})))
     env.reset(seed=0)
-    with pytest.raises(
-        ValueError, match=rf"fault 'wrong' of own_plugin must return EVENT.*{WRONG[code]}|{WRONG[code]}"
-    ):
+    with pytest.raises(ValueError, match=f"fault 'wrong' of own_plugin .*{WRONG[code]}|{WRONG[code]}"):
         env.step(0)
 
 
@@ -242,7 +236,6 @@ def test_another_content_is_another_experiment_and_a_name_alone_is_none(write, t
     path = write(HEAD + GROVE)
     one = run_name(small_config(tmp_path, plugins=[path]))
     assert one != run_name(plain)
-    (tmp_path / "elsewhere").mkdir()
     write(HEAD + GROVE + "# changed\n")
     assert run_name(small_config(tmp_path, plugins=[path])) not in (one, run_name(plain))
     named = small_config(tmp_path, name="mine")
@@ -277,17 +270,9 @@ def test_an_error_names_the_plug_in_that_it_passed_through_and_no_other(write):
         sys.modules["own_plugin"].broken()
     assert plugins.one_line(raised.value) == "KeyError: 'gone' (plug-in own_plugin, line 4)"
     assert plugins.one_line(KeyError("gone")) == "KeyError: 'gone'"
-    trace = (
-        'File "/tmp/ray/session_1/runtime_resources/py_modules_files/_ray_pkg_1/own_plugin.py", line 9, in f'
-    )
+    trace = 'File "/tmp/ray/session_1/py_modules_files/_ray_pkg_1/own_plugin.py", line 9, in f'
     assert plugins.with_culprit("KeyError", trace) == "KeyError (plug-in own_plugin, line 9)"
     assert plugins.with_culprit("KeyError", trace.replace("own_plugin", "my_own_plugin")) == "KeyError"
-
-
-def test_a_row_of_a_kind_is_checked_whatever_it_is():
-    for row in (7, SimpleNamespace(feature="x"), Kind("window", "nothing:A", "nothing:B", DenseModel)):
-        with pytest.raises((ValueError, ImportError, AttributeError)):
-            plugins._check("kind of policy", "wrong", row)
 
 
 ODD = """
@@ -312,12 +297,10 @@ LAYERS = "nn.Flatten(), nn.Linear(6, 3), nn.Linear(6, 1)"
         (GOOD, LAYERS, None),
         ("np.ones((len(windows), 3), np.float32)", LAYERS, r"its feature must be float32 \(3, 2\), got"),
         ("np.full((len(windows), 2), np.nan, np.float32)", LAYERS, "its feature must be finite, got NaN"),
-        ("np.ones((len(windows), 2))", LAYERS, r"its feature must be float32 \(3, 2\), got float64"),
         ("[[1.0, 1.0]]", LAYERS, r"its feature must be float32 \(3, 2\), got list"),
         ("windows.nothing", LAYERS, "AttributeError: .*plug-in own_odd, line 7"),
         (GOOD, "nn.Flatten(), nn.Linear(6, 4), nn.Linear(6, 1)", r"its logits must be float32 \(3, 3\)"),
         (GOOD, "nn.Flatten(), nn.Linear(6, 3), nn.Linear(6, 2)", r"its value must be float32 \(3, 1\)"),
-        (GOOD, "nn.Flatten(), nn.Linear(6, 3)", "ValueError"),
         (GOOD, "nn.Flatten(), nn.Linear(5, 3), nn.Linear(6, 1)", "RuntimeError"),
     ],
 )

@@ -28,17 +28,6 @@ def agent_of(policy, **table):
     return make_agent(str(policy), "stochastic", table)
 
 
-def test_a_flight_repeats_itself_from_its_actions(policy):
-    first = replay(SHORT, agent_of(policy), 3)
-    again = replay(SHORT, agent_of(policy), 3, first.actions)
-    assert len(first.actions) == len(first.windows) == 20
-    assert len(set(first.actions.tolist())) > 1
-    np.testing.assert_array_equal(first.actions, again.actions)
-    np.testing.assert_array_equal(first.events, again.events)
-    assert all(np.array_equal(*pair) for pair in zip(first.windows, again.windows, strict=True))
-    assert first.step_us > 0
-
-
 def test_given_actions_are_flown_whatever_the_agent_would_do(policy):
     turns, agent = np.array([1, 2] * 10), agent_of(policy)
     found = replay(SHORT, agent, 0, turns)

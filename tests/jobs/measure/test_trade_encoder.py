@@ -5,21 +5,16 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.encoder import compare
 from jobs.analysis.tables import write_csv
-from jobs.config.config import ConfigError
+from jobs.config.config import ConfigError, parse
 from jobs.measure import encodings as encoder_costs
 from jobs.measure import trade_encoder
 from jobs.measure.encodings import (
     COST_FIELDS,
     UNCHANGED,
-    Encoding,
     cost_values,
     costs_us,
     default_encodings,
-    encode_in_chunks,
-    encode_newest,
-    encode_whole,
     exact_latents,
     explained,
     read_costs,
@@ -34,7 +29,7 @@ from models.encoder.evae import event_targets, reconstruct
 from models.encoder.event_batch import batch_windows
 from models.encoder.table import EncoderTable
 from models.kinds import DenseModel
-from tests.support.configs import small_config
+from tests.support.configs import compose, small_config
 from tests.support.encoders import WINDOW_US, make_evae, make_events
 
 WINDOWS = [(make_events(count, seed=count), 0, WINDOW_US) for count in (0, 1, 40, 300)]
@@ -54,50 +49,32 @@ def test_exact_latents_are_those_of_a_table_of_very_many_bins(coding):
     assert np.abs(mu - near).max() < 1e-4
     logvar = evae(batch_windows(WINDOWS, evae.grid))[2].numpy()
     assert np.allclose(deviation, np.exp(0.5 * logvar), rtol=0.05)
-
-
-def test_exact_latents_of_complex_contexts_are_refused():
     with pytest.raises(ValueError, match="got 'eventnet'"):
         exact_latents(make_evae(coding="eventnet"), WINDOWS)
 
 
 def test_every_form_but_the_coarse_ones_gives_the_default_latent():
-    evae = make_evae()
-    forms = {(form.knob, form.setting): form.encode for form in default_encodings(evae)}
-    default = np.stack([forms["default", ""](window) for window in WINDOWS])
-    for key in [("chunks", text) for text in ("1", "2", "5", "20", "per event")] + [("newest events", "500")]:
-        assert np.array_equal(np.stack([forms[key](window) for window in WINDOWS]), default), key
-    assert np.abs(np.stack([forms["torch", "plain network"](w) for w in WINDOWS]) - default).max() < 2e-6
+    forms = {(form.knob, form.setting): form.encode for form in default_encodings(make_evae(time_bins=1024))}
+    latents = {key: np.stack([encode(window) for window in WINDOWS]) for key, encode in forms.items()}
+    default = latents["default", ""]
+    exact = [("chunks", text) for text in ("1", "2", "5", "20", "per event")] + [("newest events", "500")]
+    for key in (*exact, *UNCHANGED):
+        assert np.array_equal(latents[key], default), key
+    assert np.abs(latents["torch", "plain network"] - default).max() < 2e-6
     for key in [("precision", "int8"), ("time bins", "16"), ("newest events", "250")]:
-        assert not np.array_equal(np.stack([forms[key](window) for window in WINDOWS]), default), key
-
-
-def test_the_newest_events_are_the_last_ones():
-    table = EncoderTable.from_evae(make_evae())
-    events = make_events(300)
-    expected = table.encode(events[-7:], 0, WINDOW_US)
-    assert np.array_equal(encode_newest(table, 7)((events, 0, WINDOW_US)), expected)
+        assert not np.array_equal(latents[key], default), key
+    events, start_us, window_us = WINDOWS[-1]
+    newest = forms["default", ""]((events[-250:], start_us, window_us))
+    assert np.array_equal(latents["newest events", "250"][-1], newest)
 
 
 def test_more_chunks_cost_more():
-    evae = make_evae()
-    table = EncoderTable.from_evae(evae)
-    forms = [
-        Encoding("", "", encode, evae) for encode in (encode_whole(table), encode_in_chunks(table, None))
-    ]
+    wanted = ("", "per event")
+    forms = [one for one in default_encodings(make_evae()) if one.setting in wanted]
     costs = costs_us(forms, (WINDOWS[-1:], WINDOWS[2:3]), rounds=3)
     assert costs.shape == (2, 2)
     assert (costs[1] > 5 * costs[0]).all()
     assert costs[1, 0] > 3 * costs[1, 1]  # 300 events against 40
-
-
-def test_what_is_explained_is_zero_for_the_mean_picture_and_one_for_perfection(monkeypatch):
-    evae = make_evae(target="occupancy")
-    batch = batch_windows(WINDOWS, evae.grid)
-    targets = event_targets(batch, "occupancy")
-    for picture, expected in ((targets, 1.0), (targets.mean(0).expand_as(targets), 0.0)):
-        monkeypatch.setattr(encoder_costs, "reconstruct", lambda logits, target, p=picture: p)
-        assert explained(evae, batch) == pytest.approx(expected, abs=1e-6)
 
 
 def test_what_is_explained_follows_the_latents_that_are_given():
@@ -124,14 +101,6 @@ def test_only_what_computes_the_same_as_the_default_repeats_its_timing():
     assert repeats(rows) == [rows[0], rows[1], rows[3]]
 
 
-def test_rows_that_compute_the_same_give_the_same_latents():
-    evae = make_evae(time_bins=1024)
-    forms = [form for form in default_encodings(evae) if (form.knob, form.setting) in UNCHANGED]
-    assert len(forms) == len(UNCHANGED)
-    latents = [np.stack([form.encode(window) for window in WINDOWS]) for form in forms]
-    assert all(np.array_equal(latents[0], other) for other in latents)
-
-
 def test_costs_are_read_as_they_were_written(tmp_path):
     rows = [make_row(), make_row("torch", cost=1234.5), make_row("time bins", setting="16", error=1 / 3)]
     write_csv(tmp_path / "costs.csv", COST_FIELDS, [cost_values(row) for row in rows])
@@ -152,11 +121,7 @@ def test_the_published_costs_are_those_of_the_page():
     with (REPOSITORY / "docs" / "data" / "encoder_costs.csv").open() as file:
         rows = {(row["knob"], row["setting"]): row for row in csv.DictReader(file)}
     usual, network = rows["default", ""], rows["torch", "plain network"]
-    alike = [
-        row
-        for key, row in rows.items()
-        if key in {("default", ""), ("time bins", "1024"), ("newest events", "4096"), ("chunks", "1")}
-    ]
+    alike = [row for key, row in rows.items() if key in UNCHANGED]
     assert {row["error_max"] for row in alike} == {usual["error_max"]} == {network["error_max"]}
     step, dense = ([int(row[column]) for row in alike] for column in ("step_us", "dense_us"))
     assert f"{min(step)} to {max(step)} us for a control step, {min(dense)} to {max(dense)} us for" in page
@@ -168,33 +133,21 @@ def test_the_published_costs_are_those_of_the_page():
 
 
 def test_a_row_becomes_text_and_columns():
-    row = Measured(
-        "precision", "int16", 250.0, 0.001, {"step_us": 60.4, "error_max": 0.0123, "explained": 0.234}
-    )
-    expected = ("precision", "int16", "60", "250", "100", "0.1", "1.2", "23.4")
-    assert cost_cells(row, 25_000.0) == expected
+    outcome = {"step_us": 60.4, "error_max": 0.0123, "explained": 0.234}
+    row = Measured("precision", "int16", 250.0, 0.001, outcome)
+    assert cost_cells(row, 25_000.0) == ("precision", "int16", "60", "250", "100", "0.1", "1.2", "23.4")
     assert cost_cells(make_row(error=12.5), 10.0)[5:7] == ("1,250", "2,500")
-    assert columns([row]) == {
-        "setting": ["precision int16"],
-        "cost_us": [250.0],
-        "error": [0.001],
-        "step_us": [60.4],
-        "error_max": [0.0123],
-        "explained": [0.234],
-    }
+    others = {name: [value] for name, value in outcome.items()}
+    assert columns([row]) == {"setting": ["precision int16"], "cost_us": [250.0], "error": [0.001], **others}
 
 
 @pytest.mark.system
 def test_the_job_leaves_tables_and_figures_and_reads_its_trainings_again(tmp_path, monkeypatch):
     monkeypatch.setattr(encoder_costs, "TIME_BINS", (16, 64))
-    config = small_config(tmp_path, job="trade_encoder")
-    config = dataclasses.replace(
-        config,
-        model=dataclasses.replace(config.model, context=32),
-        collect=dataclasses.replace(config.collect, num_steps=300, num_validation_steps=60),
-        pretrain=dataclasses.replace(config.pretrain, iterations=2, batch_windows=4),
-        own=dataclasses.replace(config.own, windows=4),
-    )
+    words = "collect.num_steps=300", "collect.num_validation_steps=60", "trade_encoder.windows=4"
+    words += "model.context=32", "pretrain.iterations=2", "pretrain.batch_windows=4"
+    values = compose("+exp=bytestream", "budget=smoke", "job=trade_encoder", *words)
+    config = parse({**values, "runs_dir": str(tmp_path / "runs")})
     metrics = trade_encoder.run(config)
     folder = locate_run(config).path / "trade"
     assert {path.stem for path in folder.glob("*.png")} == {"inference"}
@@ -205,21 +158,17 @@ def test_the_job_leaves_tables_and_figures_and_reads_its_trainings_again(tmp_pat
     assert metrics["perf/encode_step_us"] > 0
 
 
-@pytest.mark.benchmark
-def test_the_table_is_tens_of_times_faster_than_the_network_and_as_fast_as_memory():
-    found = compare("additive")
-    assert found["times_faster_than_network"] >= 60
-    assert found["us_300_events"] < 100
-    assert found["of_copying"] < 2
-
-
 def test_a_policy_without_such_an_encoder_is_refused_before_anything_is_written(tmp_path):
-    model = DenseModel(name="event_columns", stack=3, hidden=[64, 64])
-    config = dataclasses.replace(small_config(tmp_path, job="trade_encoder"), model=model)
-    with pytest.raises(ConfigError, match="event_columns has no encoder of single events"):
-        trade_encoder.run(config)
-    full = small_config(tmp_path, job="trade_encoder")
-    config = dataclasses.replace(full, model=dataclasses.replace(full.model, coding="eventnet"))
-    with pytest.raises(ConfigError, match=r"model\.coding: must be additive or none.*got 'eventnet'"):
-        trade_encoder.run(config)
+
+    config = small_config(tmp_path, job="trade_encoder")
+    complex_codes = dataclasses.replace(config.model, coding="eventnet")
+    for model, rule in (
+        (
+            DenseModel(name="event_columns", stack=3, hidden=[64, 64]),
+            "event_columns has no encoder of single",
+        ),
+        (complex_codes, r"model\.coding: must be additive or none.*got 'eventnet'"),
+    ):
+        with pytest.raises(ConfigError, match=rule):
+            trade_encoder.run(dataclasses.replace(config, model=model))
     assert not list(tmp_path.iterdir())

@@ -6,11 +6,13 @@ from hypothesis import strategies as st
 
 from envs.config import EnvConfig
 from envs.event_error import measure_event_error
+from jobs.config.config import parse
+from jobs.config.env_keys import env_with
 from jobs.measure import trade_simulator
 from jobs.measure.measured import pareto
 from jobs.measure.trade_simulator import step_costs_us
 from jobs.run.folder import locate_run
-from tests.support.configs import small_config
+from tests.support.configs import compose
 
 POINTS = st.lists(st.tuples(st.integers(0, 9), st.integers(0, 9)), min_size=1, max_size=12)
 
@@ -40,12 +42,7 @@ def test_what_is_beaten_within_the_noise_is_beaten_by_what_is_more_exact_alone(p
 
 
 def test_more_renders_cost_more():
-    once, often = (
-        dataclasses.replace(
-            EnvConfig(), fidelity=dataclasses.replace(EnvConfig().fidelity, max_step_m=step_m)
-        )
-        for step_m in (1.0, 0.002)
-    )
+    once, often = (env_with(EnvConfig(), {"fidelity.max_step_m": step_m}) for step_m in (1.0, 0.002))
     costs = step_costs_us([once, often], steps=10, rounds=3)
     assert costs[1] > 3 * costs[0] > 0
 
@@ -54,11 +51,10 @@ def test_more_renders_cost_more():
 def test_the_job_leaves_tables_and_figures_and_a_second_run_replaces_them(tmp_path, monkeypatch):
     knobs = {"renders": [{"renders": 1}, {"renders": 3}], "encoding": [{"camera.encoding": "linear8"}]}
     monkeypatch.setattr(trade_simulator, "KNOBS", knobs)
-    config = small_config(tmp_path, job="trade_simulator", exp="trade_simulator")
-    trade = dataclasses.replace(
-        config.own, scenes=["poles"], control_hz=[200.0], flights=1, steps=3, rounds=1
-    )
-    config = dataclasses.replace(config, own=trade)
+    own = {"scenes": "[poles]", "control_hz": "[200.0]", "flights": 1, "steps": 3, "rounds": 1}
+    words = [f"trade_simulator.{name}={value}" for name, value in own.items()]
+    values = compose("+exp=trade_simulator", "budget=smoke", *words)
+    config = parse({**values, "runs_dir": str(tmp_path / "runs")})
     metrics = trade_simulator.run(config)
     assert trade_simulator.run(config).keys() == metrics.keys()
     folder = locate_run(config).path / "trade"

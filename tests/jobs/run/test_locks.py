@@ -1,3 +1,4 @@
+import contextlib
 import multiprocessing
 import os
 import time
@@ -8,51 +9,56 @@ from jobs.run.files import RunError
 from jobs.run.locks import held_alone, locked, private_folder
 from tests.support.patience import HANG_S
 
+FORK = multiprocessing.get_context("fork")
 
-def work(folder, results, name):
-    with locked(folder / "a.lock"):
-        results.put((name, "in"))
-        time.sleep(0.3)
-        results.put((name, "out"))
+
+def work(holding, place, results, seconds):
+    with holding(place):
+        results.put((os.getpid(), "in"))
+        time.sleep(seconds)
+        results.put((os.getpid(), "out"))
+
+
+@contextlib.contextmanager
+def working(count, *asked):
+    """Processes that work in a place, and what they say of it."""
+    results = FORK.Queue()
+    args = (*asked[:2], results, asked[2])
+    processes = [FORK.Process(target=work, args=args, daemon=True) for _ in range(count)]
+    for process in processes:
+        process.start()
+    yield processes, results
+    for process in processes:
+        process.join()
 
 
 def test_processes_hold_a_lock_one_after_the_other(tmp_path):
-    context = multiprocessing.get_context("fork")
-    results = context.Queue()
-    processes = [context.Process(target=work, args=(tmp_path, results, name)) for name in "ab"]
-    for process in processes:
-        process.start()
-    order = [results.get(timeout=HANG_S) for _ in range(4)]
-    for process in processes:
-        process.join()
+    with working(2, locked, tmp_path / "a.lock", 0.1) as (_, results):
+        order = [results.get(timeout=HANG_S) for _ in range(4)]
     assert [place for _, place in order] == ["in", "out", "in", "out"]
     assert order[0][0] == order[1][0] != order[2][0] == order[3][0]
 
 
-def test_a_process_that_is_killed_lets_go(tmp_path):
-    context = multiprocessing.get_context("fork")
-    results = context.Queue()
-    process = context.Process(target=work, args=(tmp_path, results, "a"))
-    process.start()
-    assert results.get(timeout=HANG_S) == ("a", "in")
-    process.kill()
-    process.join()
-    with locked(tmp_path / "a.lock"):
-        pass
+def test_a_folder_has_one_holder_who_is_named_and_lets_go_when_it_is_killed(tmp_path):
+    with working(1, held_alone, tmp_path, HANG_S) as ((process,), results):
+        results.get(timeout=HANG_S)
+        who = rf"process {process.pid} of .* works there; wait until"
+        with pytest.raises(RunError, match=who), held_alone(tmp_path):
+            pass
+        process.kill()
+    for _ in range(2):
+        with held_alone(tmp_path):
+            pass
 
 
-def test_a_folder_has_one_holder_who_is_named(tmp_path):
-    who = rf"process {os.getpid()} of .* works there"
-    with held_alone(tmp_path), pytest.raises(RunError, match=who), held_alone(tmp_path):
-        pass
-    with held_alone(tmp_path):
-        pass
-
-
-def test_a_lock_never_writes_through_a_link(tmp_path):
+@pytest.mark.parametrize(
+    ("name", "holding"),
+    [(".lock", lambda folder: held_alone(folder)), ("a.lock", lambda folder: locked(folder / "a.lock"))],
+)
+def test_a_lock_never_writes_through_a_link(tmp_path, name, holding):
     (tmp_path / "precious").write_text("content")
-    (tmp_path / ".lock").symlink_to(tmp_path / "precious")
-    with pytest.raises(OSError, match="symbolic link"), held_alone(tmp_path):
+    (tmp_path / name).symlink_to(tmp_path / "precious")
+    with pytest.raises(OSError, match="symbolic link"), holding(tmp_path):
         pass
     assert (tmp_path / "precious").read_text() == "content"
 
@@ -78,11 +84,3 @@ def test_a_link_in_place_of_the_private_folder_is_not_followed(tmp_path, monkeyp
     assert list((tmp_path / "of-another").iterdir()) == []
     assert (tmp_path / "file").read_text() == "content"
     assert not (tmp_path / "missing").exists()
-
-
-def test_a_link_in_place_of_a_lock_of_the_machine_is_not_followed(tmp_path):
-    (tmp_path / "precious").write_text("content")
-    (tmp_path / "start-ray.lock").symlink_to(tmp_path / "precious")
-    with pytest.raises(OSError, match="symbolic link"), locked(tmp_path / "start-ray.lock"):
-        pass
-    assert (tmp_path / "precious").read_text() == "content"

@@ -1,7 +1,6 @@
 """Every command reads recordings by the same keys, and every remedy that a refusal names works."""
 
 import re
-from pathlib import Path
 
 import h5py
 import numpy as np
@@ -12,7 +11,7 @@ from envs.recordings import write_events
 from jobs.config.config import parse
 from jobs.config.schema import RecordingConfig
 from jobs.run.recordings import read_recording, recording_parts, refused
-from jobs.training.real_recordings import fit, read_whole
+from jobs.training.real_recordings import fit
 from tests.support.configs import compose
 from tests.support.event_files import some_events
 
@@ -24,15 +23,9 @@ def settings(*words: str) -> RecordingConfig:
     return parse(compose("+exp=replay", *words)).recording
 
 
-def text(path: Path, header: str = "") -> Path:
-    events = some_events(0, 50, 64, 48, 900_000)
-    rows = [f"{t / 1e6:.6f} {x} {y} {int(p > 0)}\n" for t, x, y, p in events.tolist()]
-    path.write_text(header + "".join(rows))
-    return path
-
-
 def test_bare_rows_of_the_event_camera_dataset_need_only_the_size(tmp_path):
-    path = text(tmp_path / "events.txt")
+    events, path = some_events(0, 50, 64, 48, 900_000), tmp_path / "events.txt"
+    path.write_text("".join(f"{t / 1e6:.6f} {x} {y} {int(p > 0)}\n" for t, x, y, p in events.tolist()))
     with pytest.raises(ValueError, match="give width and height") as caught:
         fit(path, ENV, settings())
     said = str(refused("replay.recording", path, caught.value))
@@ -54,12 +47,10 @@ def test_a_refusal_names_keys_and_the_command_with_them_reads_the_file(tmp_path)
 
 def test_a_group_and_a_range_of_times_are_keys_too(tmp_path, capsys):
     with h5py.File(tmp_path / "a.h5", "w") as file:
-        for side in ("left", "right"):
-            for name in "txyp":
-                file[f"prophesee/{side}/{name}"] = (
-                    np.arange(4) % (2 if name == "p" else 9) * (1 + (side == "right"))
-                )
-            file[f"prophesee/{side}/p"][:] = [0, 1, 0, 1]
+        for side, scale in (("left", 1), ("right", 2)):
+            for name in "txy":
+                file[f"prophesee/{side}/{name}"] = scale * np.arange(4)
+            file[f"prophesee/{side}/p"] = [0, 1, 0, 1]
     read_recording(tmp_path / "a.h5", settings())
     assert "recording.group chooses another of prophesee/left, prophesee/right" in capsys.readouterr().out
     right = settings("recording.group=prophesee/right", "recording.start_us=2", "recording.end_us=6")
@@ -90,21 +81,9 @@ def test_gaps_are_closed_and_the_steps_are_those_of_the_events(tmp_path):
     events = some_events(1, 4000, 64, 48, 400_000)
     late = events.copy()
     late["t"] += 3_000_000_000
-    joined = np.concatenate((events, late))
-    write_events(tmp_path / "a.npz", joined, 64, 48)
+    write_events(tmp_path / "a.npz", np.concatenate((events, late)), 64, 48)
     fitted = fit(tmp_path / "a.npz", ENV, RecordingConfig())
     assert fitted.gaps == 1
     assert fitted.steps == pytest.approx(2 * 80, abs=2)
     assert np.all(np.diff(fitted.events["t"]) >= 0)
     assert fitted.events["t"][-1] < 900_000
-
-
-def test_a_recording_in_which_no_large_pixel_fires_has_steps_without_events(tmp_path):
-    few = some_events(2, 40, 640, 480, 1_000_000)
-    write_events(tmp_path / "a.npz", few, 640, 480)
-    recorded, fitted = read_whole(tmp_path / "a.npz", ENV)
-    assert (recorded.events.size, fitted.num_events) == (0, 40)
-    assert len(recorded.ends_us) >= 150
-    write_events(tmp_path / "b.npz", few[:0], 640, 480)
-    with pytest.raises(ValueError, match="contains 0 events; name another file"):
-        read_whole(tmp_path / "b.npz", ENV)

@@ -15,22 +15,20 @@ from tests.support.configs import small_config
 from tests.support.policies import HELD_OUT, save_training
 
 
-def finish_training(tmp_path, name, exp="bytestream", seed=0, env_steps=500_000, iterations=120, **changes):
+def finish_training(
+    tmp_path, name, exp="bytestream", seed=0, env_steps=500_000, policy="event_columns", **changes
+):
     """A run folder as a finished training leaves it."""
     folder = tmp_path / "runs" / name
     values = as_dict(small_config(tmp_path, exp=exp, seed=seed, **changes))
     values["train"]["env_steps"] = env_steps
-    save_training(folder / "policy", exp, seed, HELD_OUT, "bytestream")
+    save_training(folder / "policy", exp, seed, HELD_OUT, policy)
     (folder / "train").mkdir()
     (folder / "stages").mkdir()
     (folder / "config.json").write_text(json.dumps(values))
     rows = [
-        {
-            "env_steps": 2048 * (k + 1),
-            "train/success_rate": k / 120 if k else None,
-            "train/distance_m": 1.0 * k,
-        }
-        for k in range(iterations)
+        {"env_steps": 2048 * (k + 1), "train/success_rate": k / 120 or None, "train/distance_m": 1.0 * k}
+        for k in range(120)
     ]
     (folder / "train" / "results.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     (folder / "stages" / "train.json").write_text(json.dumps({"figures": {}, "commit": "abc"}))
@@ -56,15 +54,15 @@ def test_the_newest_training_of_each_group_and_seed_is_taken(tmp_path):
 
 
 def test_a_published_policy_decides_nearly_as_the_trained_one_in_a_fraction_of_the_space(tmp_path):
-    (training,) = [finish_training(tmp_path, "run")] and newest_trainings(tmp_path / "runs", "smoke")
+    finish_training(tmp_path, "run", policy="bytestream")
+    (training,) = newest_trainings(tmp_path / "runs", "smoke")
     target = publish(training, tmp_path / "pretrained")
     assert target.name == "bytestream-s0"
     manifest = json.loads((target / "policy.json").read_text())
     assert (manifest["exp"], manifest["run"], manifest["commit"]) == ("bytestream", "run", "abc")
-    sizes = [
-        sum(file.stat().st_size for file in folder.iterdir()) for folder in (target, training.path / "policy")
-    ]
-    assert sizes[0] < sizes[1] / 20
+    folders = target, training.path / "policy"
+    small, large = (sum(file.stat().st_size for file in folder.iterdir()) for folder in folders)
+    assert small < large / 20
     lean, whole = load_policy(target), load_policy(training.path / "policy")
     windows = np.zeros((1, 4097, 4), np.int32)
     windows[0, :3] = [2, 0, 5000, 0], [1000, 20, 30, 1], [4000, 40, 30, -1]
@@ -103,15 +101,17 @@ def test_curves_are_read_back_as_written_if_their_policies_are_still_there(tmp_p
     assert as_csv(list(found.values())) == as_csv([learning_curve(training) for training in kept])
 
 
-def test_nothing_to_publish_is_said_with_where_it_was_sought(tmp_path):
-    with pytest.raises(ConfigError, match="runs_dir: no finished training with budget=paper in"):
-        publishing.run(small_config(tmp_path, job="publish", exp="ship", budget="paper"))
-
-
-def test_trainings_that_learn_nothing_are_not_published(tmp_path):
+@pytest.mark.parametrize(
+    ("budget", "rule"),
+    [
+        ("paper", "runs_dir: no finished training with budget=paper in"),
+        ("smoke", "budget: smoke learns nothing"),
+    ],
+)
+def test_without_trainings_that_learn_there_is_nothing_to_publish(tmp_path, budget, rule):
     finish_training(tmp_path, "run")
-    with pytest.raises(ConfigError, match="budget: smoke learns nothing"):
-        publishing.run(small_config(tmp_path, job="publish", exp="ship"))
+    with pytest.raises(ConfigError, match=rule):
+        publishing.run(small_config(tmp_path, job="publish", exp="ship", budget=budget))
 
 
 @pytest.mark.system  # it fills a store, which takes seconds
@@ -122,10 +122,8 @@ def test_the_job_writes_policies_curves_and_their_plot(tmp_path, monkeypatch):
     for seed in (0, 1):
         finish_training(tmp_path, f"run{seed}", seed=seed, budget="paper")
     finish_training(tmp_path, "rival", exp="event_set", budget="paper")
-    assert publishing.run(small_config(tmp_path, job="publish", exp="ship", budget="paper")) == {
-        "bytestream": 2,
-        "event_set": 1,
-    }
+    published = publishing.run(small_config(tmp_path, job="publish", exp="ship", budget="paper"))
+    assert published == {"bytestream": 2, "event_set": 1}
     names = sorted(path.name for path in (tmp_path / "pretrained").iterdir())
     assert names == ["bytestream-s0", "bytestream-s1", "curves.csv", "event_set-s0"]
     assert (tmp_path / "learning.png").stat().st_size > 10_000
@@ -138,11 +136,8 @@ def test_the_job_writes_policies_curves_and_their_plot(tmp_path, monkeypatch):
 def test_a_published_policy_says_which_commit_and_device_made_each_stage(tmp_path):
     """An encoder may come from an older commit and from a GPU, of which the last stage says nothing."""
     path = finish_training(tmp_path, "run")
-    older = {"figures": {}, "commit": "older", "device": "cuda"}
-    (path / "stages" / "pretrain.json").write_text(json.dumps(older))
+    older = {"commit": "older", "device": "cuda"}
+    (path / "stages" / "pretrain.json").write_text(json.dumps({"figures": {}, **older}))
     (training,) = newest_trainings(tmp_path / "runs", "smoke")
     manifest = load_policy(publish(training, tmp_path / "published")).manifest
-    assert manifest["made_by"] == {
-        "pretrain": {"commit": "older", "device": "cuda"},
-        "train": {"commit": "abc", "device": None},
-    }
+    assert manifest["made_by"] == {"pretrain": older, "train": {"commit": "abc", "device": None}}

@@ -21,20 +21,12 @@ def folder(tmp_path):
 
 
 def test_the_file_has_the_events_and_labels_that_the_camera_of_the_command_line_gives(tmp_path, folder):
-    words = (
-        "camera=dvs128",
-        *SMALL,
-        "light=night",
-        "seed=5",
-        "video_events.fps=50",
-        f"video_events.path={folder}",
-    )
-    config, path = converted(tmp_path, *words)
+    words = "camera=dvs128", *SMALL, "light=night", "seed=5", "video_events.fps=50"
+    config, path = converted(tmp_path, *words, f"video_events.path={folder}")
     assert path.name == "events.npz"
     assert config.env.faults.shot_noise_hz > 0
-    expected = quietly(
-        folder, config.env.camera, config.env.faults, fps=50.0, rng=np.random.default_rng(config.seed)
-    )
+    camera, faults, rng = config.env.camera, config.env.faults, np.random.default_rng(config.seed)
+    expected = quietly(folder, camera, faults, fps=50.0, rng=rng)
     written = read_events(path)
     assert expected.events.size > 1000
     assert expected.is_noise.any()
@@ -44,11 +36,8 @@ def test_the_file_has_the_events_and_labels_that_the_camera_of_the_command_line_
 
 
 def test_a_format_without_labels_is_written_and_the_job_says_so(tmp_path, folder, capsys):
-    words = (
-        "video_events.fps=50",
-        f"video_events.path={folder}",
-        f"video_events.output={tmp_path / 'made' / 'ride.aedat4'}",
-    )
+    output = tmp_path / "made" / "ride.aedat4"
+    words = "video_events.fps=50", f"video_events.path={folder}", f"video_events.output={output}"
     config, path = converted(tmp_path, *words)
     assert "npz" in capsys.readouterr().out
     written = read_events(path)
@@ -60,17 +49,14 @@ def test_a_grey_step_in_black_fires_no_event_unless_the_floor_of_the_video_is_lo
     """Frames of 8 bits that are linear in light, where grey 1 may be noise."""
     black = np.zeros((2, 12, 16, 3), np.uint8)
     black[1] = 1
-    words = (
-        f"video_events.path={save(tmp_path / 'black', black, '.png')}",
-        "video_events.fps=50",
-        "video_events.transfer=linear",
-    )
-    _, usual = converted(
-        tmp_path, *words, "camera.luminance_floor=1e-4", f"video_events.output={tmp_path / 'a.npz'}"
-    )
-    low = ("video_events.luminance_floor=1e-3", f"video_events.output={tmp_path / 'b.npz'}")
-    assert read_events(usual).events.size == 0
-    assert read_events(converted(tmp_path, *words, *low)[1]).events.size == 7 * 12 * 16
+    words = "video_events.fps=50", "video_events.transfer=linear"
+    path = f"video_events.path={save(tmp_path / 'black', black, '.png')}"
+    for floor, fired in (
+        ("camera.luminance_floor=1e-4", 0),
+        ("video_events.luminance_floor=1e-3", 7 * 12 * 16),
+    ):
+        output = f"video_events.output={tmp_path / f'{fired}.npz'}"
+        assert read_events(converted(tmp_path, *words, path, floor, output)[1]).events.size == fired
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from tests.support.configs import small_config
 from tests.support.policies import save_training
 from tests.support.stores import place_store
 
-STEPS = 12
+STEPS = 5
 SEEN = ("bytestream", "event_image", "rgb")
 TAGS = {"seed": 3, "commit": "c0ffee", "eval/success_rate": 1 / 3}
 
@@ -50,8 +50,11 @@ def as_input(observation):
 
 
 def load(tracker, name):
-    mlflow.set_tracking_uri(tracker.uri)
-    return mlflow.pyfunc.load_model(f"models:/{name}")
+    mlflow.set_tracking_uri(tracker.uri)  # also in the environment, for whatever is started later
+    try:
+        return mlflow.pyfunc.load_model(f"models:/{name}")
+    finally:
+        mlflow.set_tracking_uri(None)
 
 
 # The kernels that travel with the encoder of single events compile anew, for most of a minute.
@@ -72,15 +75,11 @@ def test_a_registered_policy_gives_the_logits_and_actions_of_the_policy_itself(s
 def test_a_training_is_registered_once_and_its_tags_are_renewed(store):
     tracker, folders = store
     first = register(tracker, folders["event_image"], "once", TAGS)
-    assert (
-        register(tracker, folders["event_image"], "once", {**TAGS, "eval/success_rate": 0.5})
-        == first
-        == "evade-once/1"
-    )
+    renewed = {**TAGS, "eval/success_rate": 0.5}
+    assert register(tracker, folders["event_image"], "once", renewed) == first == "evade-once/1"
     assert register(tracker, folders["rgb"], "once", TAGS) == "evade-once/2"
     client = tracker.client
-    versions = {version.version: version for version in client.search_model_versions("name = 'evade-once'")}
-    assert set(versions) == {1, 2} or set(versions) == {"1", "2"}
+    assert len(client.search_model_versions("name = 'evade-once'")) == 2
     one = client.get_model_version("evade-once", "1")
     assert one.run_id == tracker.run_id
     assert {"seed": "3", "commit": "c0ffee", "eval/success_rate": "0.5"}.items() <= one.tags.items()
@@ -96,10 +95,8 @@ def test_trainings_of_any_length_are_versions_of_their_experiments_model(store, 
         settings = {"exp": "lengths", "seed": 0, "budget": "paper", "train": {"env_steps": env_steps}}
         write_json(run / "config.json", settings)
         write_json(run / "stages" / "train.json", {"commit": "c0ffee", "figures": {}})
-    assert [register_training(tracker, tmp_path / name) for name in lengths] == [
-        "evade-lengths/1",
-        "evade-lengths/2",
-    ]
+    found = [register_training(tracker, tmp_path / name) for name in lengths]
+    assert found == ["evade-lengths/1", "evade-lengths/2"]
     versions = tracker.client.search_model_versions("name = 'evade-lengths'")
     assert {version.tags["env_steps"] for version in versions} == {"500000", "1500000"}
 
@@ -111,6 +108,6 @@ def test_a_model_holds_the_policys_own_files_and_the_code_that_reads_them_and_no
     kept = {path.relative_to(place).as_posix() for path in place.rglob("*") if path.is_file()}
     own = {path.name for path in folders["bytestream"].iterdir()}
     assert own == {Path(path).name for path in kept if path.startswith("artifacts/")}
-    assert {"served_policy.py", "code/models/policy/policy.py", "MLmodel", "requirements.txt"} <= kept
-    assert "code/core/__init__.py" in kept
+    code = {"served_policy.py", "code/models/policy/policy.py", "code/core/__init__.py"}
+    assert code | {"MLmodel", "requirements.txt"} <= kept
     assert {Path(path).suffix for path in kept} <= {".py", ".json", ".safetensors", ".yaml", ".txt", ""}

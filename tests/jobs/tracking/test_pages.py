@@ -54,12 +54,8 @@ def test_a_table_that_would_be_cut_is_linked_instead():
 
 
 def test_the_experiments_first_line_leads_to_the_newest_sweep():
-    views = {
-        "results": "Results",
-        "charts-1": "Sweep 1: charts",
-        "charts-2": "Sweep 2: charts",
-        "table-2": "T",
-    }
+    views = {"results": "Results", "charts-1": "Sweep 1: charts", "charts-2": "Sweep 2: charts"}
+    views |= {"table-2": "T"}
     tags = {
         f"mlflow.sharedViewState.{key}": packed_view(name, chart_view("", []), now_ms)
         for now_ms, (key, name) in enumerate(views.items())
@@ -135,43 +131,28 @@ in_browser = pytest.mark.slow  # it opens pages: a minute or more
 
 
 @in_browser
-def test_the_experiment_says_what_it_is_and_shows_results_by_run(pages):
+@pytest.mark.parametrize(
+    ("name", "pictures", "words"),
+    [
+        ("runs", 0, ("Evade: policies that fly by the events", "Results", "Learning curves", "Sweeps",
+                     "bytestream-smoke-s0-", "eval/success_rate", "eval/distance_m", "sim/event_error")),
+        ("training", 1, ("From nothing to an evaluated policy", "success in held-out corridors", "Commit",
+                         "Event error asked: at most 0.05; achieved:", "policy stochastic",
+                         "camera.contrast_threshold", "host", "evade-bytestream")),
+        ("sweep", 3, ("Policies at other rates and thresholds", "charts", "sweep/control_hz.png",
+                      "sweep/sparsity.png", "Success [%] with 95 % intervals", "control_hz=100",
+                      "Child runs")),
+        ("charts", 0, ("sweep/control_hz_success", "sweep/sparsity_percent_success", "2 matching runs")),
+    ],
+)  # fmt: skip
+def test_a_page_shows_what_it_is_its_figures_settings_and_origin(pages, name, pictures, words):
     browser, at = pages
-    browser.open(
-        at["runs"], "Evade: policies that fly by the events", "Results", "Learning curves", "Sweeps",
-        "bytestream-smoke-s0-", "eval/success_rate", "eval/distance_m", "sim/event_error",
-    )  # fmt: skip
-
-
-@in_browser
-def test_a_trainings_page_shows_its_figures_settings_and_origin(pages):
-    browser, at = pages
-    browser.open(
-        at["training"], "From nothing to an evaluated policy", "success in held-out corridors", "Commit",
-        "Event error asked: at most 0.05; achieved:", "policy stochastic", "camera.contrast_threshold",
-        "host", "evade-bytestream",
-    )  # fmt: skip
-    assert browser.wait(f"{pictures_shown} >= 1", "the ways flown")
-
-
-@in_browser
-def test_a_sweeps_page_shows_its_report_figures_first_and_its_children_by_condition(pages):
-    browser, at = pages
-    text = browser.open(
-        at["sweep"], "Policies at other rates and thresholds", "charts", "sweep/control_hz.png",
-        "sweep/sparsity.png", "Success [%] with 95 % intervals", "control_hz=100", "Child runs",
-    )  # fmt: skip
-    assert text.index("sweep/control_hz.png") < text.index("Success [%] with 95 % intervals")
-    assert browser.wait(f"{pictures_shown} >= 3", "a picture for each axis, and the contacts")
-
-
-@in_browser
-def test_charts_show_each_group_over_each_axis(pages):
-    browser, at = pages
-    browser.open(
-        at["charts"], "sweep/control_hz_success", "sweep/sparsity_percent_success", "2 matching runs"
-    )
-    browser.shows("straight")
+    text = browser.open(at[name], *words)
+    if name == "sweep":
+        assert text.index("sweep/control_hz.png") < text.index("Success [%] with 95 % intervals")
+    if name == "charts":
+        browser.shows("straight")
+    assert browser.wait(f"{pictures_shown} >= {pictures}", "the figures")
 
 
 @in_browser
@@ -199,10 +180,3 @@ def test_the_store_of_the_repository_is_served_by_make_and_any_by_the_server_its
         assert words[words.index("mlflow") : words.index("mlflow") + 2] == ["mlflow", "server"]
         assert words[-1] == uri
     assert dashboard_command("sqlite:////elsewhere/m.db") == server_command("sqlite:////elsewhere/m.db")
-
-
-def test_a_server_that_ends_is_said_at_once(tmp_path):
-    (tmp_path / "mlflow").write_text("#!/bin/sh\nexit 3\n")
-    (tmp_path / "mlflow").chmod(0o755)
-    with pytest.raises(RuntimeError, match="ended with status 3"), served("sqlite:///x.db", tmp_path):
-        pass

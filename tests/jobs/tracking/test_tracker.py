@@ -6,6 +6,7 @@ import shlex
 import signal
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from click.testing import CliRunner
@@ -35,53 +36,43 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Run:
     return open_run(small_config(tmp_path_factory.mktemp("tracking")))
 
 
-def test_what_is_logged_can_be_read_back(folder, tmp_path):
+def test_what_is_logged_can_be_read_back_and_reopening_continues_the_same_run(folder, tmp_path):
     (tmp_path / "note.txt").write_text("hello")
     with open_tracker(folder.config, folder) as tracker:
         tracker.log(3, {"eval/success_rate": 0.25, "eval/distance_m": math.nan})
         tracker.text("eval/table.md", "| a |")
         tracker.table("eval/results", {"agent": ["policy", "oracle"], "success_rate": [0.2, 1.0]})
         tracker.artifact(tmp_path / "note.txt", "eval")
-    run = tracker.client.get_run(tracker.run_id)
-    assert run.info.status == "FINISHED"
-    assert run.info.run_name == folder.path.name
+    client, run_id = tracker.client, tracker.run_id
+    run = client.get_run(run_id)
+    assert (run.info.status, run.info.run_name) == ("FINISHED", folder.path.name)
     assert run.data.metrics == {"eval/success_rate": 0.25}
-    assert [
-        (m.step, m.value) for m in tracker.client.get_metric_history(tracker.run_id, "eval/success_rate")
-    ] == [(3, 0.25)]
     assert run.data.params["camera.contrast_threshold"] == "0.2"
     assert run.data.tags["run_folder"] == str(folder.path)
     assert run.data.tags["mlflow.note.content"].endswith("| a |")
     assert "eval/distance_m" in run.data.tags["not_measured"]
-    assert {file.path for file in tracker.client.list_artifacts(tracker.run_id, "eval")} == {
-        "eval/table.md", "eval/results.json", "eval/note.txt"
-    }  # fmt: skip
-
-
-def test_a_table_takes_the_place_of_an_earlier_one(folder, tmp_path):
-    with open_tracker(folder.config, folder, key="tables") as tracker:
-        for rates in ([0.2, 1.0], [0.5, math.nan, 0.1]):
-            names = ["policy", "oracle", "straight"][: len(rates)]
-            tracker.table("eval/results", {"agent": names, "success_rate": rates})
-    file = tracker.client.download_artifacts(tracker.run_id, "eval/results.json", str(tmp_path))
-    rows = [["policy", 0.5], ["oracle", None], ["straight", 0.1]]
-    assert json.loads(Path(file).read_text()) == {"columns": ["agent", "success_rate"], "data": rows}
-
-
-def test_reopening_continues_the_same_run(folder):
-    with open_tracker(folder.config, folder) as first:
-        first.log(1, {"train/episode_return": 1.0})
+    files = {file.path for file in client.list_artifacts(run_id, "eval")}
+    assert files == {"eval/table.md", "eval/results.json", "eval/note.txt"}
     with open_tracker(folder.config, folder) as second:
-        assert first.client.get_run(second.run_id).info.status == "RUNNING"
-        second.log(2, {"train/episode_return": 2.0})
-    assert second.run_id == first.run_id
-    assert len(second.client.get_metric_history(second.run_id, "train/episode_return")) == 2
+        assert client.get_run(second.run_id).info.status == "RUNNING"
+        second.log(4, {"eval/success_rate": 0.5})
+        names = {"agent": ["policy", "oracle", "straight"], "success_rate": [0.5, math.nan, 0.1]}
+        second.table("eval/results", names)  # takes the place of the earlier one
+    assert second.run_id == run_id
+    history = client.get_metric_history(run_id, "eval/success_rate")
+    assert [(point.step, point.value) for point in history] == [(3, 0.25), (4, 0.5)]
+    file = client.download_artifacts(run_id, "eval/results.json", str(tmp_path))
+    rows = [["policy", 0.5], ["oracle", None], ["straight", 0.1]]
+    assert json.loads(Path(file).read_text()) == {"columns": list(names), "data": rows}
 
 
-def test_a_run_that_raises_ends_as_failed(folder):
-    with pytest.raises(ZeroDivisionError), open_tracker(folder.config, folder, key="broken") as tracker:
-        raise ZeroDivisionError
-    assert tracker.client.get_run(tracker.run_id).info.status == "FAILED"
+@pytest.mark.parametrize(
+    ("error", "status"), [(ZeroDivisionError(), "FAILED"), (Ended(signal.SIGTERM), "KILLED")]
+)
+def test_a_run_that_raises_ends_as_failed_and_one_that_a_signal_ends_as_killed(folder, error, status):
+    with pytest.raises(type(error)), open_tracker(folder.config, folder, key=status) as tracker:
+        raise error
+    assert tracker.client.get_run(tracker.run_id).info.status == status
 
 
 def test_a_saved_view_stands_in_the_experiments_tags_and_its_text_leads_there(folder):
@@ -115,14 +106,18 @@ def test_the_page_of_a_run_shows_small_copies_of_its_pictures_and_its_tables(fol
     assert "page/page" not in " ".join(tracker.files())
 
 
-def test_the_store_lies_beside_the_runs_folder_whatever_the_working_folder(folder, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    base = Path(folder.config.runs_dir).parent
-    assert store_uri(folder.config) == f"sqlite:///{base}/mlflow.db"
+def test_a_store_lies_beside_the_runs_folder_of_any_name_whatever_the_working_folder(tmp_path, monkeypatch):
+    base = tmp_path / "job%2Fmain 100%25done a?b#c&d=e"
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    place_store(base / "mlflow.db")
+    folder = open_run(small_config(base))
     with open_tracker(folder.config, folder) as tracker:
-        location = tracker.client.get_run(tracker.run_id).info.artifact_uri
-    assert location.startswith(f"file://{base}/mlartifacts/")
-    assert not list(tmp_path.iterdir())
+        tracker.log(1, {"eval/distance_m": 1.0})
+        tracker.text("eval/table.md", "| a |")
+    assert tracker.client.get_run(tracker.run_id).data.metrics == {"eval/distance_m": 1.0}
+    assert any((base / "mlartifacts").rglob("table.md"))
+    assert [path for path in tmp_path.rglob("*") if base not in (path, *path.parents)] == [tmp_path / "here"]
 
 
 def test_an_address_that_mlflow_keeps_no_runs_in_is_refused(folder):
@@ -131,20 +126,17 @@ def test_an_address_that_mlflow_keeps_no_runs_in_is_refused(folder):
         store_uri(dataclasses.replace(folder.config, tracking=tracking))
 
 
-@pytest.mark.parametrize("value", [math.inf, -math.inf])
-def test_infinite_metrics_are_refused_by_name(value):
-    with pytest.raises(ValueError, match=f"metrics must be finite, got eval/distance_m = {value}"):
-        check_metrics({"eval/distance_m": value, "eval/success_rate": 1.0})
-
-
-def test_metrics_outside_the_known_sections_are_refused():
-    with pytest.raises(ValueError, match="got \\['learners/x', 'plain'\\]"):
-        check_metrics({"learners/x": 1.0, "plain": 1.0, "eval/success_rate": 1.0})
-
-
-def test_a_flood_of_metrics_is_refused():
-    with pytest.raises(ValueError, match="at most 40 a call, got 41"):
-        check_metrics({f"eval/{number}": 1.0 for number in range(41)})
+@pytest.mark.parametrize(
+    ("metrics", "rule"),
+    [
+        ({"eval/distance_m": -math.inf}, "metrics must be finite, got eval/distance_m = -inf"),
+        ({"learners/x": 1.0, "plain": 1.0}, r"got \['learners/x', 'plain'\]"),
+        ({f"eval/{number}": 1.0 for number in range(40)}, "at most 40 a call, got 41"),
+    ],
+)
+def test_metrics_that_a_store_should_not_have_are_refused(metrics, rule):
+    with pytest.raises(ValueError, match=rule):
+        check_metrics({**metrics, "eval/success_rate": 1.0})
 
 
 def test_settings_that_mlflow_would_cut_are_refused():
@@ -153,7 +145,7 @@ def test_settings_that_mlflow_would_cut_are_refused():
         flatten({"a": {"b": "x" * 6001}})
 
 
-def open_new_store(uri: str) -> str:
+def _experiment_of(uri: str) -> str:
     return open_store(uri, "evade")[1]
 
 
@@ -161,7 +153,8 @@ def open_new_store(uri: str) -> str:
 def test_processes_that_start_together_make_one_store(tmp_path):
     uri = f"sqlite:///{tmp_path}/mlflow.db"
     with ProcessPoolExecutor(3) as pool:
-        assert len(set(pool.map(open_new_store, [uri] * 3))) == 1
+        opened = list(pool.map(_experiment_of, [uri] * 3))
+    assert len(set(opened)) == 1
 
 
 def test_children_are_written_once_and_replaced_where_their_content_has_changed(folder):
@@ -188,18 +181,14 @@ def test_children_are_written_once_and_replaced_where_their_content_has_changed(
 
 def test_curves_wait_while_the_store_is_away_and_are_delivered_before_the_run_ends(folder, monkeypatch):
     monkeypatch.setattr(retry_queue, "RETRY_AFTER_S", 0.0)
+    silent = Mock(side_effect=MlflowException("API request failed", error_code=INTERNAL_ERROR))
     with open_tracker(folder.config, folder, key="away") as tracker:
-        answer = tracker.client.log_batch
-
-        def silent(*given, **named):
-            raise MlflowException("API request failed", error_code=INTERNAL_ERROR)
-
         tracker.log(1, {"train/episode_return": 1.0})
-        monkeypatch.setattr(tracker.client, "log_batch", silent)
-        tracker.log(2, {"train/episode_return": 2.0})
-        tracker.log(3, {"train/episode_return": math.nan})
+        with monkeypatch.context() as away:
+            away.setattr(tracker.client, "log_batch", silent)
+            tracker.log(2, {"train/episode_return": 2.0})
+            tracker.log(3, {"train/episode_return": math.nan})
         assert len(tracker.retry_queue.rows()) == 2
-        monkeypatch.setattr(tracker.client, "log_batch", answer)
     assert not tracker.retry_queue.file.exists()
     history = tracker.client.get_metric_history(tracker.run_id, "train/episode_return")
     assert [(point.step, point.value) for point in history] == [(1, 1.0), (2, 2.0)]
@@ -221,21 +210,14 @@ def test_a_store_that_does_not_answer_stops_with_one_error_that_says_where_the_r
 ):
     monkeypatch.setitem(tracking.MANY_RETRIES, "MLFLOW_HTTP_REQUEST_MAX_RETRIES", "0")
     nowhere = dataclasses.replace(folder.config.tracking, uri="http://127.0.0.1:9")
-    config = dataclasses.replace(folder.config, tracking=nowhere)
-    with (
-        pytest.raises(TrackingError, match=rf"127\.0\.0\.1:9 does not answer \(.*refused.*{folder.path}"),
-        open_tracker(config, folder),
-    ):
-        pass
+    rule = rf"127\.0\.0\.1:9 does not answer \(.*refused.*{folder.path}"
+    with pytest.raises(TrackingError, match=rule):
+        open_tracker(dataclasses.replace(folder.config, tracking=nowhere), folder).__enter__()
 
 
 def test_a_second_process_is_kept_out_of_the_run_folder(folder):
-    with (
-        held_alone(folder.path),
-        pytest.raises(RunError, match=r"works there; wait until it has ended"),
-        open_tracker(folder.config, folder),
-    ):
-        pass
+    with held_alone(folder.path), pytest.raises(RunError, match="works there; wait until it has ended"):
+        open_tracker(folder.config, folder).__enter__()
 
 
 def test_a_run_that_was_deleted_in_mlflow_is_recorded_again_with_all_its_curves(tmp_path):
@@ -263,11 +245,8 @@ def test_an_experiment_that_was_deleted_is_named_with_a_command_that_restores_it
     folder = open_run(small_config(tmp_path))
     client, experiment_id = open_store(store_uri(folder.config), "evade")
     client.delete_experiment(experiment_id)
-    with (
-        pytest.raises(TrackingError, match=r"^tracking\.experiment: 'evade' was deleted") as error,
-        open_tracker(folder.config, folder),
-    ):
-        pass
+    with pytest.raises(TrackingError, match=r"^tracking\.experiment: 'evade' was deleted") as error:
+        open_tracker(folder.config, folder).__enter__()
     from mlflow.cli import cli
 
     variable, *words = shlex.split(re.search("`(.*)`", str(error.value))[1])
@@ -298,25 +277,6 @@ def test_a_store_that_refuses_is_told_in_one_line_with_its_remedy(folder, code, 
     assert remedy in str(error.value)
 
 
-def test_a_store_lies_in_a_folder_of_any_name(tmp_path):
-    name = "job%2Fmain 100%25done a?b#c&d=e"
-    place_store(tmp_path / name / "mlflow.db")
-    folder = open_run(small_config(tmp_path / name))
-    with open_tracker(folder.config, folder) as tracker:
-        tracker.log(1, {"eval/distance_m": 1.0})
-        tracker.text("eval/table.md", "| a |")
-    assert (tmp_path / name / "mlflow.db").stat().st_size
-    assert tracker.client.get_run(tracker.run_id).data.metrics == {"eval/distance_m": 1.0}
-    assert any((tmp_path / name / "mlartifacts").rglob("table.md"))
-    assert sorted(path.name for path in tmp_path.iterdir()) == [name]
-
-
-def test_a_job_that_a_signal_ends_is_killed_in_mlflow(folder):
-    with pytest.raises(Ended), open_tracker(folder.config, folder, key="ended") as tracker:
-        raise Ended(signal.SIGTERM)
-    assert tracker.client.get_run(tracker.run_id).info.status == "KILLED"
-
-
 def test_a_refusal_leaves_neither_run_folder_nor_store(tmp_path):
     folder = open_run(small_config(tmp_path))
     with pytest.raises(ConfigError), open_tracker(folder.config, folder):
@@ -339,7 +299,6 @@ URI, EXPERIMENT = "MLFLOW_TRACKING_URI", "MLFLOW_EXPERIMENT_NAME"
 @pytest.mark.parametrize(
     ("variables", "words", "uri", "said"),
     [
-        ({URI: "sqlite:///team.db"}, [], "sqlite:///team.db", "sets tracking.uri=sqlite:///team.db"),
         ({URI: "http://u:secret@host"}, [], "http://u:secret@host", "sets tracking.uri=http://***@host"),
         ({URI: "http://h"}, ["tracking.uri=sqlite:///a.db"], "sqlite:///mlflow.db", "the command line gives"),
         ({URI: "databricks"}, [], "sqlite:///mlflow.db", "is not used: must begin with"),

@@ -101,16 +101,15 @@ def test_planted_noise_is_recovered_from_a_still_scene():
         events, frames = still_planted(48, luminance, faults=faults)
         found = estimate(events, frames, PLAIN).found
         held += agree(found, {f"faults.{name}": value for name, value in faults.items()})
-        assert [name for name in NAMES if found[name].value is None and name.startswith("camera")] == [
-            ON, OFF, MISMATCH, CUTOFF, DEAD,
-        ]  # fmt: skip
+        untold = [name for name in NAMES if found[name].value is None and name.startswith("camera")]
+        assert untold == [ON, OFF, MISMATCH, CUTOFF, DEAD]
         assert all(part.reason for part in found.values() if part.value is None)
         if "hot_pixel_share" not in faults:
             assert found[HOT_SHARE].value == 0.0
     assert np.mean(held) >= 0.9
 
 
-@pytest.mark.parametrize(("on", "off", "dead_us"), [(0.2, 0.2, 0), (0.15, 0.4, 0), (0.3, 0.2, 3000)])
+@pytest.mark.parametrize(("on", "off", "dead_us"), [(0.15, 0.4, 0), (0.3, 0.2, 3000)])
 def test_thresholds_of_a_perfect_sensor_are_found_exactly(footage, on, off, dead_us):
     part = Footage(footage.luminance[:301, :16], footage.times_us[:301])
     camera = {"contrast_threshold": on, "contrast_threshold_off": off, "refractory_us": dead_us}
@@ -123,7 +122,7 @@ def test_thresholds_of_a_perfect_sensor_are_found_exactly(footage, on, off, dead
     assert most(none) < 0.02
 
 
-@pytest.mark.parametrize("scene", range(8))
+@pytest.mark.parametrize("scene", range(4))
 def test_frames_of_another_scene_tell_no_threshold(scene):
     """No thresholds rather than wrong ones: not below 0, above what a camera has, or anything between."""
     part = {"width": 24, "waving": 8, "flickering": 0, "still": 0}
@@ -132,23 +131,18 @@ def test_frames_of_another_scene_tell_no_threshold(scene):
     found = estimate(planted(seen), shown, PLAIN).found
     assert {found[name].value for name in BY_LIGHT} == {None}
     assert "fit each other" in found[ON].reason
-    fits = estimate(planted(seen), seen, PLAIN).found
-    assert fits[ON].value == pytest.approx(0.2, rel=0.05)
 
 
-def test_equations_without_a_number_tell_no_threshold():
-    table = Equations(np.full((2, 4, 2, 2), np.nan), np.full((2, 4, 2), np.nan), np.full((2, 4), 100.0))
-    assert [part.value for part in thresholds(table, RNG)] == [None, None]
-
-
-@pytest.mark.parametrize(("pixels", "is_told"), [(1, False), (2, False), (8, True)])
-def test_pixels_whose_light_changes_must_be_enough_to_be_drawn_again(pixels, is_told):
-    """Draws without any of them have no solution."""
-    matrix, right = np.zeros((2, 40, 2, 2)), np.zeros((2, 40, 2))
-    matrix[:, :pixels], right[:, :pixels] = np.eye(2), 0.2
+@pytest.mark.parametrize(
+    ("pixels", "number", "is_told"), [(2, 0.0, False), (8, 0.0, True), (8, np.nan, False)]
+)
+def test_pixels_whose_light_changes_must_be_enough_to_be_drawn_again(pixels, number, is_told):
+    """Draws without any of them have no solution, nor have equations without a number."""
+    matrix, right = np.full((2, 40, 2, 2), number), np.full((2, 40, 2), number)
+    matrix[:, :pixels], right[:, :pixels] = np.eye(2) + number, 0.2 + number
     found = thresholds(Equations(matrix, right, np.full((2, 40), 100.0)), RNG)
     assert [part.value is not None for part in found] == [is_told, is_told]
-    assert is_told or "too few pixels" in found[0].reason
+    assert is_told or np.isnan(number) or "too few pixels" in found[0].reason
 
 
 @pytest.mark.parametrize(
