@@ -83,7 +83,7 @@ class Sensor:
             self._real = RealSensor(camera, self._config.faults, state, rng, t_us)
 
     def step(self, start: Point, outcome: Outcome, end_us: int, way: np.ndarray | None = None) -> None:
-        """Simulate one control step from whole images: render along the flown way and set the events.
+        """Simulate one control step from whole images: render along the way and set the events.
 
         The parts between renders last at least one microsecond. A vehicle stopped by contact or goal stands
         still for the rest of the step and sees nothing new. Without an event camera, only the end of the

@@ -42,19 +42,8 @@ def postgres(tmp_path_factory):
     data = str(place / "data")
     pg("initdb", "--pgdata", data, "--auth", "trust", "--no-sync")
     options = f"-p {port} -c listen_addresses=127.0.0.1 -k {place} -c fsync=off"
-    pg(
-        "pg_ctl",
-        "--pgdata",
-        data,
-        "--wait",
-        "--timeout",
-        "300",
-        "-l",
-        str(place / "log"),
-        "-o",
-        options,
-        "start",
-    )
+    log = str(place / "log")
+    pg("pg_ctl", "--pgdata", data, "--wait", "--timeout", "300", "-l", log, "-o", options, "start")
     try:
         pg("createdb", "--host", "127.0.0.1", "--port", str(port), "evade")
         yield f"postgresql://postgres@127.0.0.1:{port}/evade"
@@ -65,12 +54,9 @@ def postgres(tmp_path_factory):
 
 def in_store(folder, uri, seed):
     config = sweep_config(folder, policies=["straight", "oracle"])
-    return dataclasses.replace(
-        config,
-        seed=seed,
-        tracking=dataclasses.replace(config.tracking, uri=uri),
-        cluster=dataclasses.replace(config.cluster, storage=str(folder / "storage")),
-    )
+    tracking = dataclasses.replace(config.tracking, uri=uri)
+    cluster = dataclasses.replace(config.cluster, storage=str(folder / "storage"))
+    return dataclasses.replace(config, seed=seed, tracking=tracking, cluster=cluster)
 
 
 def report(folder, uri, seed):

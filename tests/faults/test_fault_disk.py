@@ -6,7 +6,6 @@ import os
 import re
 import shutil
 import signal
-import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -40,6 +39,7 @@ from tests.support.encoders import make_events
 from tests.support.faults import ROOT, forked, leave_room, outcome
 from tests.support.policies import save_training
 from tests.support.runs import planned, write_encoder
+from tests.support.started import started
 
 pytestmark = pytest.mark.faults
 SHORT = ("budget=smoke", "env.time_limit_s=0.1")
@@ -178,20 +178,17 @@ def killing(notes: Path):
     os.replace = replace
 
 
-@pytest.mark.parametrize("job", ["sweep"])
-def test_a_kill_at_each_rename_leaves_what_the_same_command_continues_to_the_same(job, tmp_path, calm):
+def test_a_kill_at_each_rename_leaves_what_the_same_command_continues_to_the_same(tmp_path, calm):
     prepare(tmp_path)
     notes, status = tmp_path / "killed", -signal.SIGKILL
     while status == -signal.SIGKILL:
-        status, said = run_job(tmp_path, job, fault=functools.partial(killing, notes))
+        status, said = run_job(tmp_path, "sweep", fault=functools.partial(killing, notes))
     assert status == 0, said
     assert len(notes.read_text().splitlines()) >= 8
     for part in tmp_path.rglob("*.part"):
         part.unlink()
-    same(tmp_path, calm(job), tmp_path / "mlflow.db")
-    outcome(
-        f"killed at each rename, {job}", "the same command continues to the same", "the file that was written"
-    )
+    same(tmp_path, calm("sweep"), tmp_path / "mlflow.db")
+    outcome("killed at each rename, sweep", "the same command continues to the same", "the file under way")
 
 
 def slow():
@@ -414,24 +411,20 @@ def test_a_file_that_finds_the_disk_full_is_named_and_leaves_the_old_one(name, s
 KERNEL = "import numba\n\n@numba.njit(cache=True)\ndef inner(x):\n    return x + 1.0\n"
 
 
-@pytest.mark.parametrize("room", ["envs", "models"])
-def test_compiled_kernels_that_are_cut_are_compiled_again(room, tmp_path):
-    package = tmp_path / room
+def test_compiled_kernels_that_are_cut_are_compiled_again(tmp_path):
+    package = tmp_path / "envs"  # models prepares its kernels alike
     package.mkdir()
-    shutil.copy(ROOT / room / "__init__.py", package)
+    shutil.copy(ROOT / "envs" / "__init__.py", package)
     shutil.copytree(ROOT / "core", tmp_path / "core")
     (package / "kernel.py").write_text(KERNEL)
-    words = [sys.executable, "-c", f"from {room}.kernel import inner; print(inner(1.0))"]
+    words = (sys.executable, "-c", "from envs.kernel import inner; print(inner(1.0))")
 
-    def run() -> str:
-        return subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False).stdout
-
-    assert run() == "2.0\n"
+    assert started(*words, cwd=tmp_path).stdout == "2.0\n"
     for pattern in ("*.nbi", "*.nbc"):
         (file,) = package.rglob(pattern)
         content = file.read_bytes()
         for damaged in (b"", cut(content)):
             file.write_bytes(damaged)
-            assert run() == "2.0\n"
+            assert started(*words, cwd=tmp_path).stdout == "2.0\n"
             assert len(file.read_bytes()) == len(content)
-    outcome(f"damaged: compiled kernels of {room}", "compiled again", "a minute")
+    outcome("damaged: compiled kernels", "compiled again", "a minute")

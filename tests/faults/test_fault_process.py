@@ -11,6 +11,7 @@ import pytest
 from jobs.tracking.tracker import open_store
 from tests.support.faults import (
     FINE,
+    JUMPS,
     OUTGROW,
     SEEING,
     TASKS,
@@ -178,13 +179,6 @@ def test_a_sweep_that_stood_still_gives_the_same_episodes(tmp_path):
     assert said in job.said
     outcome("sweep stopped for seconds and continued", "the same episodes", "nothing")
     outcome("sweep worker stopped for longer than its limit", "ended, tried again; others go on", "that part")
-
-
-JUMPS = """
-import time
-real, begun = time.time, time.monotonic()
-time.time = lambda: real() + (3600.0, -3600.0, 0.0)[int(time.monotonic() - begun) // 2 % 3]
-"""
 
 
 def test_clock_jumps_change_no_episode_and_no_duration_of_a_sweep(tmp_path):

@@ -1,6 +1,5 @@
 """Faults beside a training: nothing is lost but the steps since its last checkpoint."""
 
-import json
 import os
 import re
 import shutil
@@ -11,7 +10,19 @@ import pytest
 
 from jobs.training.ppo.train import FIGURES, LOSSES
 from jobs.training.train import METRICS
-from tests.support.faults import FINE, TRAIN, check_complete, launch, outcome, start
+from tests.support.faults import (
+    FINE,
+    JUMPS,
+    TRAIN,
+    check_complete,
+    check_second_refused,
+    cut,
+    fill,
+    flip,
+    launch,
+    outcome,
+    start,
+)
 
 pytestmark = pytest.mark.faults
 SAME = ["env_steps", *(name for name in [*METRICS, *LOSSES, *FIGURES] if not name.startswith("perf/"))]
@@ -22,30 +33,11 @@ def checkpoints(job):
     return sorted(job.run.glob("train/PPO*/checkpoint_*"))
 
 
-def test_an_env_runner_that_is_killed_is_started_again_and_counted(tmp_path):
-    job = launch(tmp_path, *TRAIN, *FINE)
-    job.wait(lambda: job.steps() >= 128)
-    (pid,) = job.workers("ray::PlainEnvRunner")
-    before = job.steps()
-    os.kill(pid, signal.SIGKILL)
-    check_complete(job)
-    restarts = json.loads((job.run / "stages" / "train.json").read_text())["figures"][
-        "perf/env_runner_restarts"
-    ]
-    assert restarts == 1
-    repeated = [row["env_steps"] for row in job.rows() if row["env_steps"] > before]
-    outcome("env runner killed", "started again, goes on where it was (restarts in results: 1)", "nothing")
-    assert repeated
-
-
 def test_a_killed_driver_continues_by_the_printed_command(tmp_path):
     # Long enough to be still at work when the other has started.
     job = launch(tmp_path, *TRAIN, *FINE, "train.env_steps=6400")
     job.wait(lambda: job.steps() >= 128)
-    refused = start(tmp_path, job.printed_command())
-    assert refused.end() == 1
-    assert f"{job.run}: process {job.process.pid} of " in refused.said
-    assert "works there; wait until it has ended" in refused.said
+    check_second_refused(tmp_path, job)
     job.wait(lambda: job.steps() >= 320)
     job.kill_alone()
     before = job.rows()
@@ -68,48 +60,36 @@ def test_ctrl_c_stops_a_training_that_the_same_command_continues(tmp_path):
     outcome("Ctrl+C, training", "status 130; the same command continues", "0 results")
 
 
-def cut(checkpoint):
-    file = largest(checkpoint)
-    file.write_bytes(file.read_bytes()[:-100])
-
-
-def flip(checkpoint):
-    file = largest(checkpoint)
-    content = bytearray(file.read_bytes())
-    content[len(content) // 2] ^= 1
-    file.write_bytes(content)
-
-
 def largest(checkpoint):
     return max(checkpoint.rglob("*.*"), key=lambda path: path.stat().st_size)
 
 
-@pytest.mark.parametrize(
-    ("how", "harm"), [("cut", cut), ("changed in one bit", flip), ("gone", shutil.rmtree)]
-)
-def test_a_damaged_checkpoint_is_left_for_the_one_before(tmp_path, how, harm):
+def newest(job):
+    return checkpoints(job)[-2:]  # the kill may have come before the newest was named
+
+
+HARMS = {
+    "checkpoint cut": lambda job: [cut(largest(path)) for path in newest(job)],
+    "checkpoint changed in one bit": lambda job: [flip(largest(path)) for path in newest(job)],
+    "checkpoint gone": lambda job: [shutil.rmtree(path) for path in newest(job)],
+    "Tune's state cut": lambda job: cut(*job.run.glob("train/experiment_state-*.json")),
+}
+SAID = {
+    "checkpoint": r"Checkpoint damaged \(.*takes its place",
+    "Tune's": "State of the training damaged, the one before takes its place",
+}
+
+
+@pytest.mark.parametrize("harm", HARMS)
+def test_what_is_damaged_is_left_for_what_was_kept_before(tmp_path, harm):
     job = launch(tmp_path, *TRAIN, *FINE)
     job.wait(lambda: job.steps() >= 320 and len(checkpoints(job)) >= 3)
     job.kill()
-    for path in checkpoints(job)[-2:]:  # the kill may have come before the newest was named
-        harm(path)
+    HARMS[harm](job)
     again = start(tmp_path, job.printed_command())
     check_complete(again)
-    assert "Checkpoint damaged (" in again.said
-    assert "takes its place" in again.said
-    outcome(f"checkpoint {how}", "said aloud, the newest whole one is taken", "the steps since that one")
-
-
-def test_what_tune_knows_is_kept_whole(tmp_path):
-    job = launch(tmp_path, *TRAIN, *FINE)
-    job.wait(lambda: job.steps() >= 320 and len(checkpoints(job)) >= 3)
-    job.kill()
-    (state,) = job.run.glob("train/experiment_state-*.json")
-    state.write_bytes(state.read_bytes()[:-100])  # as a full disk does
-    again = start(tmp_path, job.printed_command())
-    check_complete(again)
-    assert "State of the training damaged, the one before takes its place" in again.said
-    outcome("Tune's state cut", "said aloud, the one that was kept is taken", "steps since a checkpoint")
+    assert re.search(SAID[harm.split()[0]], again.said, re.DOTALL)
+    outcome(harm, "said aloud, the newest whole one is taken", "the steps since that one")
 
 
 BUG = """
@@ -127,38 +107,35 @@ CRASH = BUG.replace("raise ValueError", "__import__('os')._exit(3);")
 HANG = BUG.replace("raise ValueError", "import time; time.sleep(10**6);")
 
 
-@pytest.mark.parametrize("runners", [0, 1])
-def test_a_bug_in_the_simulation_stops_at_once_with_its_reason(tmp_path, runners):
-    job = launch(tmp_path, *TRAIN, *FINE, f"algo.num_env_runners={runners}", after={"envs.corridor": BUG})
-    assert job.end() == 1
-    reason = "ValueError: episode 3, step 7, seed 0: the reward must be finite; got nan"
-    assert job.said.splitlines()[-1].startswith(
-        f"evade: failed: training stopped: {reason}; the same command"
-    )
-    assert job.said.count("goes on") == 0
-    where = "the learner's process" if runners == 0 else "an env runner"
-    outcome(
-        f"NaN or a bug in {where}", "stops at the first time, with its reason", "steps since a checkpoint"
-    )
-
-
 NO_WORLD = """
 def refuse(self, *values, **named):
     raise TypeError("there is no such world")
 CorridorVectorEnv.__init__ = refuse
 """
+NAN = "ValueError: episode 3, step 7, seed 0: the reward must be finite; got nan"
 
 
-@pytest.mark.parametrize("runners", [0, 2])
-def test_a_world_that_cannot_be_made_stops_at_once_with_its_reason(tmp_path, runners):
-    job = launch(
-        tmp_path, *TRAIN, *FINE, f"algo.num_env_runners={runners}", after={"envs.corridor": NO_WORLD}
-    )
+@pytest.mark.parametrize(
+    ("code", "reason", "runners"),
+    [
+        (BUG, NAN, 0),
+        (BUG, NAN, 1),
+        (NO_WORLD, "TypeError: there is no such world", 0),
+        (NO_WORLD, "TypeError: there is no such world", 2),
+    ],
+)
+def test_a_bug_in_the_simulation_or_no_world_stops_at_once_with_its_reason(tmp_path, code, reason, runners):
+    job = launch(tmp_path, *TRAIN, *FINE, f"algo.num_env_runners={runners}", after={"envs.corridor": code})
     assert job.end() == 1
-    reason = "evade: failed: training stopped: TypeError: there is no such world; the same command"
-    assert job.said.splitlines()[-1].startswith(reason)
+    said = f"evade: failed: training stopped: {reason}; the same command"
+    assert job.said.splitlines()[-1].startswith(said)
     assert job.said.count("goes on") == 0
-    outcome(f"no world, {runners} env runners", "stops at once, with its reason", "nothing")
+    what = "NaN or a bug" if code == BUG else "no world"
+    outcome(
+        f"{what}, {runners} env runners",
+        "stops at the first time, with its reason",
+        "steps since a checkpoint",
+    )
 
 
 def test_a_bug_that_ends_the_process_each_time_stops_after_a_few_restarts(tmp_path):
@@ -184,15 +161,10 @@ def test_an_env_runner_that_hangs_is_ended_and_started_again(tmp_path):
 
 
 def test_clock_jumps_change_no_result(tmp_path):
-    jumps = """
-import time
-real, begun = time.time, time.monotonic()
-time.time = lambda: real() + (3600.0, -3600.0, 0.0)[int(time.monotonic() - begun) // 2 % 3]
-"""
-    job = launch(tmp_path, *TRAIN, *FINE, first=jumps)
+    job = launch(tmp_path, *TRAIN, *FINE, first=JUMPS)
     job.wait(lambda: job.steps() >= 320)
     job.kill()
-    again = start(tmp_path, job.printed_command(), first=jumps)
+    again = start(tmp_path, job.printed_command(), first=JUMPS)
     check_complete(again)
     speeds = [row["perf/env_steps_per_second"] for row in again.rows()]
     assert all(speed is None or 0 < speed < 1e5 for speed in speeds)
@@ -218,9 +190,8 @@ def short_folder():
 
 def test_a_disk_that_is_full_stops_with_its_reason_and_the_same_command_continues(small_disk, short_folder):
     job = launch(small_disk, *TRAIN, "train.env_steps=960", "train.checkpoint_every=1", TMPDIR=short_folder)
-    filler = small_disk / "filler"
     job.wait(lambda: job.steps() >= 256)
-    fill(filler)
+    filler = fill(small_disk)
     assert job.end() == 1, job.said
     # A file met the full disk first, or the store did.
     assert re.search("No space left on device|database or disk is full", job.said.splitlines()[-1]), job.said
@@ -231,17 +202,6 @@ def test_a_disk_that_is_full_stops_with_its_reason_and_the_same_command_continue
         "stops with the reason; with room, the same command continues",
         "steps since a checkpoint",
     )
-
-
-def fill(file):
-    """Take all the room that there is."""
-    with file.open("wb", buffering=0) as stream:
-        for size in (1 << 20, 1 << 12):
-            try:
-                while True:
-                    stream.write(b"\0" * size)
-            except OSError:
-                continue
 
 
 def test_a_training_that_is_disturbed_ends_with_the_bytes_of_one_that_is_not(tmp_path):

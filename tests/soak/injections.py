@@ -18,7 +18,7 @@ from typing import Protocol
 
 from tests.soak.dashboard import Dashboard
 from tests.soak.workload import KILLED_S, Lane
-from tests.support.faults import command_line
+from tests.support.faults import command_line, cut, fill, flip
 
 GOES_ON = "the jobs go on"
 COMMAND = "the printed command continues"
@@ -167,18 +167,6 @@ def trained(lane: Lane) -> bool:
     return any(lane.place.glob("runs/*/stages/train.json"))
 
 
-def cut(file: Path) -> None:
-    """Take away the last 100 bytes."""
-    file.write_bytes(file.read_bytes()[:-100])
-
-
-def flip(file: Path) -> None:
-    """Change one bit in the middle."""
-    content = bytearray(file.read_bytes())
-    content[len(content) // 2] ^= 1
-    file.write_bytes(content)
-
-
 def cut_episodes(soak: Soak) -> Lanes:
     """A driver killed, and one of its files of episodes cut before it continues."""
     found = [lane for lane in working(soak) if list(lane.place.glob("runs/*/*/episodes/*.json"))]
@@ -196,13 +184,11 @@ def fill_disk(soak: Soak) -> Lanes:
     """No room for 20 s where the runs are; commands are given again when there is."""
     if soak.disk is None:
         return None
-    lanes, filler = working(soak), soak.disk / "filler"
+    lanes = working(soak)
     for lane in soak.lanes.values():
         lane.held = True
+    filler = fill(soak.disk)
     try:
-        with filler.open("wb", buffering=0) as stream, suppress(OSError):
-            while True:
-                stream.write(b"\0" * (1 << 20))
         soak.run_for(20.0)
     finally:
         filler.unlink()

@@ -1,15 +1,11 @@
 """What a soak has to say: the faults and what followed, rounds, trends of memory, what was left behind."""
 
 import dataclasses
-import re
 from collections import defaultdict
 from collections.abc import Sequence
-from pathlib import Path
 
 from jobs.analysis.tables import markdown_table
 from tests.soak.workload import Round
-
-MARKS = re.compile(r"(<!-- soak -->\n).*?(<!-- /soak -->)", re.DOTALL)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,15 +97,3 @@ def markdown(summary: Summary) -> str:
         "\n".join(f"- {line}" for line in [*summary.facts, *summary.findings]),
     ]
     return "\n\n".join(part.strip() for part in parts if part.strip()) + "\n"
-
-
-def write_page(page: Path, text: str) -> None:
-    """Put the report between the two comments of a page.
-
-    Raises:
-        ValueError: The page has no such comments.
-    """
-    whole = page.read_text()
-    if not MARKS.search(whole):
-        raise ValueError(f"page: must hold <!-- soak --> and <!-- /soak -->, got {page}")
-    page.write_text(MARKS.sub(lambda marks: f"{marks[1]}\n{text}\n{marks[2]}", whole))

@@ -2,10 +2,9 @@
 
 Run: make test-soak ARGS="minutes=60 seed=0", or python -m tests.soak.soak
 Expect: an undisturbed round first (some minutes), then the hour, then the end of the last rounds; a
-report, its plot and its numbers in `build/soak`; exit status 1 if a table differs, a job does not go on,
-or anything is left behind. With `page=FILE` the report goes between that page's comments `soak`, and its plot
-into docs/images/soak.png. `size=small` computes less in each round, `every=30` injects a fault every 30 s,
-and `only=driver,Ctrl` injects only faults whose names have one of these words.
+report and its numbers in `build/soak`; exit status 1 if a table differs, a job does not go on, or anything is
+left behind. `size=small` computes less in each round, `every=30` injects a fault every 30 s, and
+`only=driver,Ctrl` injects only faults whose names have one of these words.
 """
 
 import contextlib
@@ -29,8 +28,8 @@ from tests.soak import workload
 from tests.soak.dashboard import Dashboard
 from tests.soak.injections import EITHER, FAULTS, Fault, down
 from tests.soak.processes import adopt_orphans, end_all, living, reap
-from tests.soak.report import Event, Summary, markdown, write_page
-from tests.soak.watch import Watch, plot, size_mb, slope_mb_per_hour
+from tests.soak.report import Event, Summary, markdown
+from tests.soak.watch import Watch, size_mb, slope_mb_per_hour
 from tests.soak.workload import End, Lane
 from tests.support.faults import descendants
 
@@ -307,20 +306,10 @@ def stop(number: int, frame: object) -> None:
 
 def main(words: list[str]) -> int:
     """Run the soak; return the exit status."""
-    given = {
-        "minutes": "60",
-        "seed": "0",
-        "size": "full",
-        "every": "60",
-        "out": "build/soak",
-        "page": "",
-        "only": "",
-    }
+    given = {"minutes": "60", "seed": "0", "size": "full", "every": "60", "out": "build/soak", "only": ""}
     unknown = [word for word in words if word.partition("=")[0] not in given]
     if unknown:
-        print(
-            f"{unknown[0]}: no such word; known: {', '.join(f'{name}=' for name in given)}", file=sys.stderr
-        )
+        print(f"{unknown[0]}: no such word; known: {', '.join(given)}", file=sys.stderr)
         return 2
     given |= dict(word.split("=", 1) for word in words)
     faults = [fault for fault in FAULTS if any(part in fault.name for part in given["only"].split(","))]
@@ -332,11 +321,8 @@ def main(words: list[str]) -> int:
         soak = Soak(folder, workload.SIZES[given["size"]], int(given["seed"]), faults)
         with burying(soak):
             soak.undisturbed()
-            print(
-                "Undisturbed:",
-                {name: f"{lane.rounds[0].seconds:.0f} s" for name, lane in soak.lanes.items()},
-                flush=True,
-            )
+            took = {name: f"{lane.rounds[0].seconds:.0f} s" for name, lane in soak.lanes.items()}
+            print("Undisturbed:", took, flush=True)
             soak.disturbed(float(given["minutes"]), float(given["every"]))
             soak.watch.stop()
             return close(soak, out, given)
@@ -355,11 +341,7 @@ def close(soak: Soak, out: Path, given: dict[str, str]) -> int:
     )
     text = markdown(summary)
     soak.watch.write(out)
-    figure = plot(soak.watch, [(event.minute, event.well) for event in soak.events])
-    figure.savefig(out / "soak.png", dpi=120)
     (out / "report.md").write_text(text)
-    if given["page"]:
-        write_page(Path(given["page"]), text)
     print(text, flush=True)
     wrong = bool(findings) or not all(event.well for event in soak.events)
     return int(wrong)

@@ -1,4 +1,4 @@
-"""What a soak writes down every five seconds: processes, memory, open files, disk; and its plot."""
+"""What a soak writes down every five seconds: processes, memory, open files, disk."""
 
 import contextlib
 import csv
@@ -11,10 +11,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
 
-from jobs.analysis.colours import AMBER, BLACK, BLUE, BROWN, CYAN, GREEN, INK, MUTED, PINK, PURPLE, RED, SLATE
-from jobs.analysis.plots import tidy
 from tests.soak.dashboard import Dashboard
 from tests.soak.processes import samples, shared_memory
 
@@ -22,11 +19,6 @@ EVERY_S = 5.0
 YOUNG_S = 120.0  # a process that has just begun still imports and fills its caches
 OLD_S = 600.0  # shorter lives tell nothing about a trend: each stage loads what it needs
 FAR_S = 30.0  # between two samples that are compared
-COLOURS = {
-    "driver": BLUE, "env runner": GREEN, "sweep worker": AMBER, "other of Ray": SLATE, "raylet": CYAN,
-    "learner": PINK, "gcs_server": PURPLE, "mlflow server": RED, "soak": BLACK, "other": BROWN,
-    "runs": BLUE, "MLflow's store": RED, "temporary files": AMBER,
-}  # fmt: skip
 HEAD = ("minute", "role", "processes", "rss_mb", "largest_mb", "open_files")
 DISK_HEAD = ("minute", "runs_mb", "store_mb", "temporary_mb", "free_shm_mb")
 
@@ -124,37 +116,3 @@ def slope_mb_per_hour(lives: Sequence[Sequence[tuple[float, float]]]) -> float |
             far = apart_h > FAR_S / 3600
             slopes += ((memory[old][later] - memory[old][first])[far] / apart_h[far]).tolist()
     return float(np.median(slopes)) if slopes else None
-
-
-def plot(watch: Watch, faults: Sequence[tuple[float, bool]]) -> Figure:
-    """Draw memory, open files and disk over minutes; each fault (minute, as it must be) is a tick."""
-    figure = Figure(figsize=(9.0, 8.0), layout="constrained")
-    memory, files, disk = figure.subplots(3, 1, sharex=True)
-    roles = sorted({row[1] for row in watch.rows}, key=list(COLOURS).index)
-    minutes, *sizes, _ = zip(*watch.disk, strict=True)
-    for role in roles:
-        own = {row[0]: row for row in watch.rows if row[1] == role}
-        look = {"color": COLOURS[role], "lw": 1.2, "marker": ".", "ms": 2}
-        for panel, column in ((memory, 3), (files, 5)):  # a gap where there is no such process
-            values = [own[minute][column] if minute in own else np.nan for minute in minutes]
-            panel.plot(minutes, values, label=role, **look)
-    for name, column in zip(("runs", "MLflow's store", "temporary files"), sizes, strict=True):
-        disk.plot(minutes, column, color=COLOURS[name], lw=1.5, label=name)
-    titles = ("Resident memory of all processes of a kind [MB]", "Open files", "Disk [MB]")
-    for panel, title in zip((memory, files, disk), titles, strict=True):
-        panel.set_title(title, loc="left", fontsize=10, color=INK, pad=10)
-        panel.set_ylim(bottom=0)
-        panel.set_xlim(left=0)
-        panel.tick_params(labelsize=8)
-        tidy(panel, "y")
-        for minute, well in faults:
-            panel.axvline(minute, ymin=0.95, color=MUTED if well else RED, lw=1.2 if well else 2.5)
-    disk.set_xlabel(
-        "Minutes; the ticks above are faults, thick and red where something followed that must not",
-        fontsize=9,
-    )
-    disk.legend(frameon=False, fontsize=8, ncols=3, loc="upper right")
-    figure.legend(
-        *memory.get_legend_handles_labels(), loc="outside upper center", ncols=5, frameon=False, fontsize=8
-    )
-    return figure

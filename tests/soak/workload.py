@@ -239,10 +239,6 @@ class Lane:
                     total += path.stat().st_size
         return len(self.rounds), total
 
-    def run_folder(self) -> Path | None:
-        """The run folder of this round, if it is there already."""
-        return next(self.place.glob("runs/*"), None)
-
     def processes(self, mark: str) -> list[int]:
         """Its processes whose command line has `mark`, without those that have ended."""
         if not self.working:

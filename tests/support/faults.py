@@ -327,6 +327,20 @@ def check_ended_by_kernel(group: Path, times: int) -> None:
 
 
 FINE = ("train.env_steps=960", "train.checkpoint_every=1")
+# An hour to and fro, every two seconds.
+JUMPS = """
+import time
+real, begun = time.time, time.monotonic()
+time.time = lambda: real() + (3600.0, -3600.0, 0.0)[int(time.monotonic() - begun) // 2 % 3]
+"""
+
+
+def check_second_refused(folder: Path, job: Job) -> None:
+    """A second driver of a job's run folder says which process works there, and stops."""
+    refused = start(folder, job.printed_command())
+    assert refused.end() == 1
+    assert f"{job.run}: process {job.process.pid} of " in refused.said
+    assert "works there; wait until it has ended" in refused.said
 
 
 def check_complete(job):
@@ -376,3 +390,24 @@ def leave_room(disk: Path, room: int) -> Path:
     with filler.open("wb") as file:
         os.posix_fallocate(file.fileno(), 0, max(1, state.f_bavail * state.f_frsize - room))
     return filler
+
+
+def fill(disk: Path) -> Path:
+    """Take all the room of a small disk while others write to it; the file that does."""
+    filler = disk / "filler"
+    with filler.open("wb", buffering=0) as stream, contextlib.suppress(OSError):
+        while True:
+            stream.write(b"\0" * (1 << 20))
+    return filler
+
+
+def cut(file: Path) -> None:
+    """Take away the last 100 bytes, as a full disk does."""
+    file.write_bytes(file.read_bytes()[:-100])
+
+
+def flip(file: Path) -> None:
+    """Change one bit in the middle."""
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 1
+    file.write_bytes(content)

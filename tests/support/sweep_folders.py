@@ -6,16 +6,12 @@ import json
 
 import numpy as np
 
-from jobs.analysis.plots import Curve
 from jobs.config.config import parse
 from jobs.rollout.episodes import EPISODE
 from jobs.rollout.table import LABELS, write_episodes
 from jobs.rollout.tasks import text_of
-from jobs.run.files import write_json
 from jobs.study.plan import axes_of, baselines_of, same_simulations
 from jobs.study.trainings import seeds_of
-from jobs.tools.curves import as_csv
-from models.policy.policy import MANIFEST
 from tests.support.configs import compose
 from tests.support.episodes import flights
 
@@ -64,53 +60,23 @@ def write_sweep(folder):
     return folder
 
 
-def write_shipped(folder, before=""):
-    """Leave learning curves in `folder`, of policies that are there, named `before` first; returns it."""
-    ends = {"bytestream": (0.8, 0.81), "event_image": (0.4, 0.41)}
-    steps = np.array([0.0, 500_000.0])
-    curves = [Curve(f"{before}{exp}", seed, steps, np.array([0.0, end]), steps)
-              for exp, both in ends.items() for seed, end in enumerate(both)]  # fmt: skip
-    for curve in curves:
-        write_json(folder / f"{curve.exp}-s{curve.seed}" / MANIFEST, {})
-    (folder / "curves.csv").write_text(as_csv(curves))
-    return folder
-
-
-def write_claims(folder, lost=(), exp="taught_claims", trainings=3):
-    """Leave a study of the paper's claims in `folder`, whose trainings lose none or one of 14; returns it.
-
-    Args:
-        folder: Where.
-        lost: Group, axis, value and how many episodes more each training loses there.
-        exp: Its experiment.
-        trainings: Of each group.
-    """
-    more = {tuple(place): count for *place, count in lost}
-
-    def failed(group, axis, value, seed):
-        return seed % 2 + more.get((group, axis, value), 0)
-
-    return write_ablation(folder, exp, failed, trainings)
-
-
 def named(at):
     """A condition as files have it."""
     return [at[0], text_of(at[1])]
 
 
-def write_ablation(folder, exp, failed, trainings=None):
+def write_ablation(folder, exp, failed):
     """Leave the study of an experiment in `folder`, 14 episodes of each training and condition; returns it.
 
     Args:
         folder: Where.
         exp: The experiment.
         failed: How many episodes fail, by group, axis, value and seed.
-        trainings: Of each group; None: all.
     """
     config = parse(compose(f"+exp={exp}"))
     axes = axes_of("poles_eval", config.own.axes)
     env = dataclasses.replace(config.env, scene="poles_eval", split="eval")
-    groups = {name: seeds_of(config, name)[:trainings] for name in config.own.variants}
+    groups = {name: seeds_of(config, name) for name in config.own.variants}
     baselines, same = baselines_of(env, axes), same_simulations(env, axes)
     about = {
         **ABOUT, "run": f"{exp}-short-s0-1", "exp": exp, "groups": groups, "trials": 14, "met": [],

@@ -1,11 +1,11 @@
 """What docs/citation.md and CITATION.cff say is what packages, pyproject.toml and the changelog say."""
 
+import contextlib
 import importlib.metadata
 import re
 import tomllib
 from pathlib import Path
 
-import pytest
 import yaml
 from packaging.requirements import Requirement
 
@@ -38,15 +38,13 @@ def test_every_package_that_the_project_names_has_one_row():
     assert sorted(package for packages, _ in ROWS for package in packages.split(", ")) == sorted(named)
 
 
-@pytest.mark.parametrize("package", LICENCES)
-def test_the_licence_of_a_row_is_what_the_package_says(package):
-    claimed = {family for family in FAMILIES if re.search(rf"\b{family}\b", LICENCES[package])}
-    assert claimed
-    try:
-        said = said_by(package)
-    except importlib.metadata.PackageNotFoundError:
-        pytest.skip(f"{package} is not installed")
-    assert {family for family in claimed if not re.search(FAMILIES[family], said)} == set()
+def test_the_licence_of_a_row_is_what_the_package_says():
+    for package, licence in LICENCES.items():
+        claimed = {family for family in FAMILIES if re.search(rf"\b{family}\b", licence)}
+        assert claimed, package
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            said = said_by(package)
+            assert {family for family in claimed if not re.search(FAMILIES[family], said)} == set(), package
 
 
 def test_the_citation_names_this_version_its_day_its_licence_and_the_paper():

@@ -1,12 +1,11 @@
 """The list of costly tests: what counts as a test's cost, and when it fails a run."""
 
-import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.support.started import ROOT, said
+
 CONFTEST = """
 from tests.support.costs import Costs
 
@@ -43,23 +42,14 @@ def test_is_not_quick():
     work(8)
 """
 
-pytestmark = pytest.mark.system
-
-
-def run(folder: Path, *options: str) -> subprocess.CompletedProcess:
-    (folder / "conftest.py").write_text(CONFTEST)
-    (folder / "test_small.py").write_text(TESTS)
-    (folder / "pytest.ini").write_text(f"[pytest]\npythonpath = {ROOT}\nmarkers = slow\n")
-    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *options, str(folder)]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+pytestmark = [pytest.mark.system, pytest.mark.slow]
 
 
 def test_a_run_fails_only_by_tests_that_work_more_than_the_limit(tmp_path):
-    done = run(tmp_path, "--most-units", "4")
-    listed = {line.split("::")[-1] for line in done.stdout.splitlines() if "test_small.py::" in line}
-    assert (done.returncode, listed) == (1, {"test_works", "test_has_a_child_that_works"}), done.stdout
-
-
-@pytest.mark.parametrize("options", [(), ("--most-units", "1000")])
-def test_a_run_below_the_limit_or_without_one_passes(tmp_path, options):
-    assert run(tmp_path, *options).returncode == 0
+    (tmp_path / "conftest.py").write_text(CONFTEST)
+    (tmp_path / "test_small.py").write_text(TESTS)
+    (tmp_path / "pytest.ini").write_text(f"[pytest]\npythonpath = {ROOT}\nmarkers = slow\n")
+    words = ("-p", "no:cacheprovider", "--most-units", "4", str(tmp_path))
+    told = said(sys.executable, "-m", "pytest", *words, cwd=tmp_path, status=1)
+    listed = {line.split("::")[-1] for line in told.splitlines() if "test_small.py::" in line}
+    assert listed == {"test_works", "test_has_a_child_that_works"}, told

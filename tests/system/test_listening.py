@@ -10,15 +10,14 @@ import subprocess
 import sys
 import time
 import urllib.request
-from pathlib import Path
 
 import pytest
 
 from tests.support.patience import HANG_S
 from tests.support.sockets import beyond_loopback, listening
+from tests.support.started import ROOT, said, started
 
 pytestmark = pytest.mark.system
-ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_the_dashboard_listens_on_loopback_alone(tmp_path):
@@ -27,11 +26,9 @@ def test_the_dashboard_listens_on_loopback_alone(tmp_path):
         port = free.getsockname()[1]
     # The last of an option counts: a port and a store of its own.
     words = f"ARGS=--port {port} --backend-store-uri sqlite:///{tmp_path}/mlflow.db"
-    recipe = subprocess.check_output(
-        ["make", "--no-print-directory", "--dry-run", "mlflow", words], cwd=ROOT, text=True
-    )
+    recipe = said("make", "--no-print-directory", "--dry-run", "mlflow", words)
     command = shlex.split("MLFLOW_SERVER" + recipe.replace("\\\n", "").rpartition("\nMLFLOW_SERVER")[2])
-    with subprocess.Popen(["env", *command], cwd=ROOT, env=os.environ) as server:
+    with subprocess.Popen(["env", *command], cwd=ROOT) as server:
         try:
             wait_for(f"http://127.0.0.1:{port}/health", server)
             found = listening(server.pid)
@@ -56,17 +53,17 @@ STRANGER = "import sys; from ray._raylet import GcsClient; GcsClient(address=sys
 
 
 @pytest.mark.slow
-def test_the_simulated_cluster_of_a_bench_listens_on_loopback_alone_and_asks_for_a_token(tmp_path):
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("RAY_AUTH")}
+def test_the_simulated_cluster_of_a_bench_listens_on_loopback_alone_and_asks_for_a_token(
+    tmp_path, monkeypatch
+):
+    for name in [name for name in os.environ if name.startswith("RAY_AUTH")]:
+        monkeypatch.delenv(name)
     command = [sys.executable, "-c", SIMULATED, str(tmp_path)]
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    with subprocess.Popen(command, cwd=ROOT, env=environment, **pipes) as cluster:
+    with subprocess.Popen(command, cwd=ROOT, **pipes) as cluster:
         address = cluster.stdout.readline().strip()
         found = listening(cluster.pid)
-        stranger = subprocess.run(
-            [sys.executable, "-c", STRANGER, address],
-            env={**environment, "RAY_AUTH_MODE": "disabled"}, capture_output=True, text=True, check=False,
-        )  # fmt: skip
+        stranger = started(sys.executable, "-c", STRANGER, address, RAY_AUTH_MODE="disabled")
         cluster.stdin.close()
         assert cluster.wait(HANG_S) == 0
     assert {"gcs_server", "raylet"} <= {name for name, _, _ in found}, found

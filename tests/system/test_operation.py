@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from jobs.tracking.tracker import open_store
+from tests.support.started import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 TRAINING = ("+exp=event_columns", "budget=smoke", "job=train", "algo=ppo")
 EVADE = """
 import signal, sys
@@ -22,7 +22,7 @@ import jobs
 sys.exit(jobs.main())
 """
 
-pytestmark = [pytest.mark.system, pytest.mark.timeout(3600)]
+pytestmark = pytest.mark.system
 
 
 def evade(folder: Path, *words: str, **variables: str) -> subprocess.Popen:
@@ -78,11 +78,7 @@ def test_a_signal_ends_a_training_as_ctrl_c_does(tmp_path, number):
     training.send_signal(number)
     _, err = training.communicate()
     assert training.returncode == 128 + number, err
-    assert (
-        err.decode()
-        .rstrip()
-        .endswith(f"evade: ended by {number.name}; the same command continues where it stopped")
-    )
+    assert f"evade: ended by {number.name}; the same command".encode() in err.splitlines()[-1]
     assert b"received at time" not in err  # Ray's own dump
     status = sqlite3.connect(tmp_path / "mlflow.db").execute("select status from runs").fetchall()
     assert status == [("KILLED",)]
@@ -93,9 +89,8 @@ def test_a_signal_ends_a_training_as_ctrl_c_does(tmp_path, number):
     assert left == []
 
 
-def test_too_many_env_runners_are_refused_and_leave_nothing(tmp_path):
-    training = evade(tmp_path, *TRAINING, "algo.num_env_runners=999")
-    _, err = training.communicate()
-    assert training.returncode == 2
-    assert b"algo.num_env_runners: needs as many CPUs" in err
+def test_too_many_env_runners_are_refused_and_leave_nothing(launch, tmp_path):
+    status, _, err = launch(*TRAINING, "algo.num_env_runners=999")
+    assert status == 2
+    assert "algo.num_env_runners: needs as many CPUs" in err
     assert list(tmp_path.iterdir()) == []

@@ -3,13 +3,13 @@
 import os
 import re
 import shlex
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.support.started import ROOT, said
+
 SLIDER = (Path(os.environ.get("EVADE_DATA", ROOT.parent / "shared" / "data")) / "rpg_slider_depth").absolute()
 PAGE = (ROOT / "docs" / "own_camera.md").read_text()
 COMMANDS = re.findall(r"^```\n(evade .*?)^```", PAGE.replace("\\\n", " "), re.MULTILINE | re.DOTALL)
@@ -26,10 +26,7 @@ pytestmark = [
 
 def run(folder: Path, *words: str) -> str:
     """Return what a command says that is given in a folder."""
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(words, cwd=folder, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
+    return said(*words, cwd=folder, PYTHONPATH=str(ROOT), OMP_NUM_THREADS="1")
 
 
 def evade(folder: Path, command: str) -> str:
@@ -40,12 +37,9 @@ def evade(folder: Path, command: str) -> str:
 
 
 def test_a_recording_becomes_a_camera_a_policy_and_its_actions(tmp_path):
-    for name, source in {
-        "events.txt": "events_chunk.txt",
-        "images.txt": "images.txt",
-        "images": "images",
-    }.items():
-        (tmp_path / name).symlink_to(SLIDER / source)
+    (tmp_path / "events.txt").symlink_to(SLIDER / "events_chunk.txt")
+    for name in ("images.txt", "images"):
+        (tmp_path / name).symlink_to(SLIDER / name)
     record, live = SNIPPETS
     assert "50000 events" in run(tmp_path, sys.executable, "-c", record)
     calibrate, train, replay = COMMANDS

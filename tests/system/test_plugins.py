@@ -1,9 +1,7 @@
 """A plug-in of one file outside the repository: it trains, is swept and reported, and its errors name it."""
 
 import json
-import os
 import re
-import subprocess
 import sys
 from pathlib import Path
 
@@ -11,9 +9,9 @@ import pytest
 
 from models.policy import load_policy
 from models.policy.policy import PolicyFileError
+from tests.support.started import ROOT, said
 
-pytestmark = pytest.mark.system
-ROOT = Path(__file__).resolve().parents[2]
+pytestmark = [pytest.mark.system, pytest.mark.slow]
 EVADE = Path(sys.executable).parent / "evade"
 PLUGIN = re.search(r"```python\n(.*?)```", (ROOT / "docs" / "extend.md").read_text(), re.DOTALL)[1]
 TRAIN = (
@@ -34,26 +32,21 @@ def trained(tmp_path_factory):
     """A folder with the plug-in, in which it has been trained and evaluated."""
     folder = tmp_path_factory.mktemp("outside")
     (folder / "forest.py").write_text(PLUGIN)
-    said = evade(folder, *TRAIN)
-    assert re.search(r"policy stochastic\s+│ forest\s+│ raycast\s+│\s+2 │\s+\d+ \[\d+, \d+\]", said), said
+    assert re.search(
+        r"policy stochastic\s+│ forest\s+│ raycast\s+│\s+2 │\s+\d+ \[\d+, \d+\]", evade(folder, *TRAIN)
+    )
     return folder
 
 
 def evade(folder: Path, *words: str, status: int = 0) -> str:
     """What the launcher says of a command given in a folder with a plug-in."""
-    environment = {**os.environ, "PYTHONPATH": ""}
-    command = [EVADE, *words, "budget=smoke", "plugins=[forest.py]"]
-    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == status, done.stdout + done.stderr
-    return done.stdout + done.stderr
+    return said(
+        EVADE, *words, "budget=smoke", "plugins=[forest.py]", cwd=folder, status=status, PYTHONPATH=""
+    )
 
 
-def test_it_is_a_file_of_thirty_lines():
-    assert len([line for line in PLUGIN.splitlines() if line.strip()]) <= 30
-
-
-@pytest.mark.slow
 def test_its_policy_trains_in_its_world_and_without_an_event_vae_at_once(trained):
+    assert len([line for line in PLUGIN.splitlines() if line.strip()]) <= 30  # as its page says
     (run,) = (trained / "runs").glob("halves-*")
     assert {path.stem for path in (run / "stages").iterdir()} == {"train", "evaluate"}
     assert not {"data", "encoder"} & {path.name for path in run.iterdir()}
@@ -64,22 +57,18 @@ def test_its_policy_trains_in_its_world_and_without_an_event_vae_at_once(trained
         load_policy(run / "policy")
 
 
-@pytest.mark.slow
 def test_its_policy_scene_and_fault_are_swept_and_reported(trained):
-    said = evade(trained, *SWEEP)
+    swept = evade(trained, *SWEEP)
     for point in (r"spot\s+│ 0\.9", r"world\s+│ forest"):
-        assert re.search(point, said), said
+        assert re.search(point, swept), swept
     assert "Written: docs/robustness.md" in evade(trained, "+exp=report")
     assert "halves" in (trained / "docs" / "robustness.md").read_text()
 
 
-@pytest.mark.slow
 def test_without_it_a_job_says_which_plug_in_is_missing(trained):
     (policy,) = (trained / "runs").glob("halves-*/policy")
-    words = ("+exp=demo", f"demo.policy={policy}")
-    done = subprocess.run([EVADE, *words], cwd=trained, capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    assert "trained with the plug-ins forest: import them first, in a job by plugins=[...]" in done.stderr
+    told = said(EVADE, "+exp=demo", f"demo.policy={policy}", cwd=trained, status=2)
+    assert "trained with the plug-ins forest: import them first, in a job by plugins=[...]" in told
 
 
 BROKEN = {
@@ -98,7 +87,6 @@ BROKEN = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("what", BROKEN)
 def test_an_error_of_a_plug_in_names_it(tmp_path, what):
     before, after, message, status = BROKEN[what]

@@ -4,15 +4,13 @@ import importlib.util
 import json
 import os
 import shutil
-import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
 from core import target
+from tests.support.started import ROOT, started
 
-ROOT = Path(__file__).resolve().parents[2]
 KERNEL = "import numba\n\n@numba.njit(cache=True)\ndef double(x):\n    return 2.0 * x\n"
 # A processor that another machine reports, and what numba compiles of a kernel there.
 RUN = """
@@ -36,12 +34,11 @@ HASWELL, ZEN4 = ("haswell", {"avx2": True, "avx512f": False}), ("znver4", {"avx2
 
 def run_on(folder, processor, **environment):
     """How many kernels a process compiles and loads if its machine reports a processor."""
-    free = {key: value for key, value in os.environ.items() if not key.startswith("NUMBA_C")}
-    words = [sys.executable, "-c", RUN, json.dumps(processor)]
-    done = subprocess.run(
-        words, cwd=folder, env=free | environment, capture_output=True, text=True, check=True, timeout=120
-    )
-    return tuple(int(word) for word in done.stdout.split())
+    free = [f"--unset={name}" for name in (target.NAME, target.FEATURES, "NUMBA_CACHE_DIR")]
+    own = [f"{name}={value}" for name, value in environment.items()]
+    ran = started("env", *free, *own, sys.executable, "-c", RUN, json.dumps(processor), cwd=folder)
+    assert ran.returncode == 0, ran.stderr
+    return tuple(int(word) for word in ran.stdout.split())
 
 
 @pytest.mark.system
@@ -54,7 +51,6 @@ def test_a_copy_of_compiled_kernels_serves_another_processor(tmp_path):
     assert run_on(first, ZEN4) == (1, 0)
     shutil.copytree(first, second, copy_function=shutil.copy)  # with times of its own, as a clone or wheel
     assert run_on(second, HASWELL) == (0, 1)
-    assert run_on(second, ZEN4) == (0, 1)
     assert run_on(second, HASWELL, NUMBA_CPU_NAME="haswell") == (1, 0)  # the user's choice, kept beside it
     assert run_on(second, HASWELL) == (0, 1)
 
@@ -81,9 +77,8 @@ def test_a_processor_without_avx2_is_refused_with_a_remedy_that_works(free, tmp_
     assert target.FEATURES not in os.environ
 
 
-@pytest.mark.parametrize("machine", ["riscv64", "amd64"])
-def test_a_machine_of_another_kind_compiles_for_itself(free, machine):
-    free.setattr(target.sysconfig, "get_platform", lambda: f"linux-{machine}")
+def test_a_machine_of_another_kind_compiles_for_itself(free):
+    free.setattr(target.sysconfig, "get_platform", lambda: "linux-riscv64")
     target.fix_target()
     assert target.NAME not in os.environ
 

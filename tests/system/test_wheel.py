@@ -1,8 +1,6 @@
 """The wheel: what is in it, and that it works without the clone and without what only jobs need."""
 
-import os
 import re
-import subprocess
 import sys
 import sysconfig
 import zipfile
@@ -10,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.started import ROOT, said, started
+
 pytestmark = pytest.mark.system
-ROOT = Path(__file__).resolve().parents[2]
 ROOMS = ("core", "envs", "models", "jobs")
 EXAMPLE = re.search(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)[1]
 # Of the extras: what `evade demo` does without, and what neither environment nor policies import.
@@ -58,7 +57,7 @@ def compiled(folder):
 @pytest.fixture(scope="module")
 def kernels():
     """Those of this clone, the first of which are compiled."""
-    subprocess.run([sys.executable, "-m", "jobs.run.compile"], cwd=ROOT, check=True)
+    said(sys.executable, "-m", "jobs.run.compile")
     return {name for name in compiled(ROOT) if name.partition("/")[0] in ROOMS}
 
 
@@ -67,9 +66,8 @@ def wheel(kernels, tmp_path_factory):
     """A wheel of this clone, built without a trace in it."""
     folder = tmp_path_factory.mktemp("wheel")
     (folder / "base.cfg").write_text(f"[build]\nbuild_base = {folder / 'build'}\n")
-    environment = {**os.environ, "DIST_EXTRA_CONFIG": str(folder / "base.cfg")}
-    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(folder), str(ROOT)]
-    subprocess.run(command, env=environment, cwd=folder, check=True, capture_output=True)
+    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", folder, ROOT]
+    said(*command, cwd=folder, DIST_EXTRA_CONFIG=str(folder / "base.cfg"))
     (path,) = folder.glob("evade-*.whl")
     return path
 
@@ -82,11 +80,9 @@ def test_it_holds_the_packages_the_policies_the_command_and_the_kernels_and_noth
     assert "envs/__pycache__/compiled_" in "".join(sorted(kernels))
     assert kernels <= set(names)
     assert {top for top in tops if not top.endswith((".dist-info", ".data"))} == {*ROOMS}
-    tracked = subprocess.check_output(["git", "ls-files", *ROOMS], cwd=ROOT, text=True)
-    assert set(tracked.splitlines()) <= set(names)
-    command = subprocess.check_output(["git", "ls-files", "conf", "platform/launch.py"], cwd=ROOT, text=True)
+    assert set(said("git", "ls-files", *ROOMS).splitlines()) <= set(names)
     installed = {name.partition("/data/share/evade/")[2] for name in names}
-    assert set(command.splitlines()) <= installed
+    assert set(said("git", "ls-files", "conf", "platform/launch.py").splitlines()) <= installed
     needed = re.findall(r"^Requires-Dist: ([\w-]+)(?!.*extra ==).*$", metadata, re.MULTILINE)
     assert {"numpy", "numba", "torch", "gymnasium", "hydra-core", "rich"} <= set(needed)
     assert set(needed).isdisjoint(ABSENT)
@@ -96,10 +92,8 @@ def test_it_holds_the_packages_the_policies_the_command_and_the_kernels_and_noth
 def test_it_works_without_the_clone_and_without_what_only_jobs_need(wheel, tmp_path):
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(tmp_path / "site")
-    environment = {**os.environ, "PYTHONPATH": str(tmp_path / "site")}
     code = without(*ABSENT, *COMMANDS_ALONE) + EXAMPLE + USES
-    command = [sys.executable, "-c", code]
-    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    done = started(sys.executable, "-c", code, cwd=tmp_path, PYTHONPATH=str(tmp_path / "site"))
     assert done.returncode == 0, done.stderr
     result, missing, place = done.stdout.splitlines()
     assert re.fullmatch(r"(True|False) \d+\.\d+", result)
@@ -111,21 +105,17 @@ def test_it_works_without_the_clone_and_without_what_only_jobs_need(wheel, tmp_p
 def test_the_command_demo_of_a_new_environment_compiles_nothing_where_its_kernels_fit(wheel, tmp_path):
     place, empty = tmp_path / "environment", tmp_path / "empty"
     empty.mkdir()
-    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    environment |= {"HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path / "cache")}
-    subprocess.run([sys.executable, "-m", "venv", "--without-pip", place], check=True)
+    own = {"PYTHONPATH": "", "HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    said(sys.executable, "-m", "venv", "--without-pip", place)
     pip = [sys.executable, "-m", "pip", "--python", place / "bin" / "python", "install", "--quiet"]
-    subprocess.run([*pip, "--no-deps", "--no-index", wheel], cwd=empty, env=environment, check=True)
+    said(*pip, "--no-deps", "--no-index", wheel, cwd=empty, **own)
     (site,) = place.glob("lib/python*/site-packages")
     (site / "dependencies.pth").write_text(sysconfig.get_path("purelib"))
     (site / "sitecustomize.py").write_text(without(*ABSENT))
     before = compiled(site)
-    done = subprocess.run(
-        [place / "bin" / "demo"], cwd=empty, env=environment, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    assert re.search(r"bytestream_hold-s0 .*\byes\b", done.stdout)
-    assert "ompil" not in done.stdout
+    shown = said(place / "bin" / "demo", cwd=empty, **own)
+    assert re.search(r"bytestream_hold-s0 .*\byes\b", shown)
+    assert "ompil" not in shown
     assert compiled(site) == before != set()
     (film,) = empty.glob("runs/*/demo/*.mp4")
     assert film.stat().st_size > 100_000
