@@ -16,7 +16,7 @@ KEYED_COLUMNS = (
     *("seed", "success", "collision", "truncated", "distance_m", "x_m", "return", "steps"),
     *("events_per_step", "dropped"),
 )
-MAX_EPISODES = 10  # most episodes of a part, in lock-step; with more, other cores would idle
+MAX_EPISODES = 10  # most episodes of a part: what is stored, retried and rolled out by one process
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Evaluate batches of parts in parallel, as trials of Ray Tune with one core each.
 
-If the process of a batch ends, or hangs longer than its limit, the batch is retried `MAX_FAILURES` times,
-and then each of its parts alone. Workers get the policies' files from the driver, so that other machines
+If the process of a batch ends, or hangs longer than its limit, each of its parts is tried alone. A single
+part is retried `MAX_FAILURES` times. Workers get the policies' files from the driver, so that other machines
 need no access to its folders.
 """
 
@@ -21,6 +21,7 @@ import torch
 from ray import tune
 from ray.tune.experiment import Trial
 
+from envs.scene import LAYOUTS, Layout
 from jobs.config.schema import ClusterConfig
 from jobs.rollout.agents import BASELINES
 from jobs.rollout.executors import Part, Recorder, evaluate_together
@@ -41,39 +42,47 @@ SNAPSHOTS = {"TUNE_GLOBAL_CHECKPOINT_S": "3600"}  # [s]
 Files = Mapping[str, Mapping[str, bytes]]  # policy folder -> name -> content
 Batch = tuple[Part, ...]
 BatchId = tuple[tuple[str, int], ...]
-MAX_ROWS = 32  # most episodes of a batch, in lock-step; more are hardly faster
-BATCHES_PER_CORE = 8  # at least; with fewer, cores would idle during the last batches
+MAX_ROWS = 32  # of a batch, in lock-step: more gain little
+MAX_PIXELS = MAX_ROWS * 346 * 260  # of a batch's cameras: their memory in a worker
+BATCHES_PER_CORE = 8  # at least: with fewer, cores would wait for the last ones
 
 
 def batches_of(parts: Sequence[Part], cores: int) -> list[Batch]:
-    """Group parts into batches that are rolled out in lock-step, starting with the parts of most steps.
+    """Return parts in batches that are rolled out in lock-step, the longest first.
 
-    Parts share a batch if they have the same policy and the same shapes of observations and actions. A batch
-    has at most `MAX_ROWS` episodes, and fewer if a core would otherwise get less than `BATCHES_PER_CORE`
-    batches. Each part of pyrender is a batch of its own, because pyrender can end its process.
+    Parts share a batch if one policy flies them and their observations and actions have one shape. A batch
+    has at most `MAX_ROWS` episodes and `MAX_PIXELS` pixels, and fewer where each of the cores would have
+    less than `BATCHES_PER_CORE` batches. Parts that pyrender may draw, which can end its process, stay alone.
     """
-    most = min(MAX_ROWS, sum(len(part.task.seeds) for part in parts) // (BATCHES_PER_CORE * cores))
+    most = min(MAX_ROWS, sum(len(part.task.seeds) for part in parts) // (BATCHES_PER_CORE * max(1, cores)))
     batches: dict[tuple[object, ...], list[list[Part]]] = defaultdict(list)
     for part in sorted(parts, key=_most_steps, reverse=True):
-        own = batches[_shapes(part)]
-        rows = sum(len(other.task.seeds) for other in own[-1]) if own else most
-        if rows + len(part.task.seeds) > most:
+        camera, own = part.task.env.camera, batches[_shapes(part)]
+        rows = len(part.task.seeds) + sum(len(other.task.seeds) for other in (own[-1] if own else []))
+        if not own or rows > min(most, MAX_PIXELS // (camera.width * camera.height)):
             own.append([])
         own[-1].append(part)
-    return [tuple(batch) for some in batches.values() for batch in some]
+    found = [tuple(batch) for some in batches.values() for batch in some]
+    return sorted(found, key=_all_steps, reverse=True)
 
 
 def _shapes(part: Part) -> tuple[object, ...]:
-    """Return the values that must be equal for all parts of a batch."""
+    """Return what the parts of a batch have in common."""
     task, env = part.task, part.task.env
-    alone = (part.task.part_id,) if env.renderer == "pyrender" else ()
-    seen = env.camera.width, env.camera.height, env.window_capacity, env.vehicle
-    return task.policy.agent, task.action, task.table, *seen, *alone
+    drawn_here = env.renderer == "auto" and isinstance(LAYOUTS.get(env.scene), Layout)
+    alone = () if drawn_here or env.renderer in ("raycast", "spheres") else (part.task.part_id,)
+    seen = env.camera.width, env.camera.height, env.window_capacity
+    return task.policy.agent, task.action, task.table, *seen, env.vehicle, env.body.get("primitives"), *alone
 
 
 def _most_steps(part: Part) -> float:
     """Return the number of control steps until the time limit of a part's episodes."""
     return part.task.env.time_limit_s * part.task.env.control_hz
+
+
+def _all_steps(batch: Batch) -> float:
+    """Return the number of control steps if every episode of a batch reaches its time limit."""
+    return sum(len(part.task.seeds) * _most_steps(part) for part in batch)
 
 
 def run_with_tune(parts: Sequence[Part], recorder: Recorder, cluster: ClusterConfig, folder: Path) -> None:
@@ -98,27 +107,26 @@ def run_with_tune(parts: Sequence[Part], recorder: Recorder, cluster: ClusterCon
 def _tuner(
     trial: Any, batches: Sequence[Batch], cluster: ClusterConfig, folder: Path, callback: "TrialCallback"
 ) -> tune.Tuner:
+    shared = any(len(batch) > 1 for batch in batches)  # these are split at once if their process ends
     return tune.Tuner(
         tune.with_resources(trial, {"cpu": 1}),
         tune_config=tune.TuneConfig(reuse_actors=True),  # a new worker imports for seconds
         param_space={
-            "trial": tune.grid_search(
-                [{"batch": batch, "limit_s": sum(map(time_limit_s, batch))} for batch in batches]
-            )
+            "trial": tune.grid_search([{"batch": batch, "limit_s": time_limit_s(batch)} for batch in batches])
         },
         run_config=tune.RunConfig(
             name="tune",
             storage_path=storage(cluster, folder),
             verbose=0,
             callbacks=[callback],
-            failure_config=tune.FailureConfig(max_failures=MAX_FAILURES),
+            failure_config=tune.FailureConfig(max_failures=0 if shared else MAX_FAILURES),
         ),
     )
 
 
-def time_limit_s(part: Part) -> float:
-    """Return the time after which a part's process counts as hanging [s]."""
-    return MAX_START_S + len(part.task.seeds) * _most_steps(part) * MAX_STEP_S
+def time_limit_s(batch: Batch) -> float:
+    """Return the time after which the process of a batch counts as hanging [s]."""
+    return MAX_START_S + _all_steps(batch) * MAX_STEP_S
 
 
 def run_trial(params: Mapping[str, Any], files: Files) -> None:
@@ -167,23 +175,20 @@ class TrialCallback(tune.Callback):
         self._lose(trial, "tried again")
 
     def on_trial_error(self, iteration: int, trials: list[Trial], trial: Trial, **info: object) -> None:
-        """Retry the batch if it had fewer than `MAX_FAILURES` failures before, else its parts one by one.
-
-        A single part is given up.
-        """
+        """Split a batch of several parts; retry a single part, or give it up after `MAX_FAILURES` retries."""
         batch = _batch_of(trial)
-        if self._ends[_id_of(batch)] < MAX_FAILURES:
+        if len(batch) > 1:
+            self._unfinished += [(part,) for part in batch]
+            self._lose(trial, "each part tried alone")
+        elif self._ends[_id_of(batch)] < MAX_FAILURES:
             self._unfinished.append(batch)
             self._lose(trial, "tried again")
-        elif len(batch) > 1:
-            self._unfinished += [(part,) for part in batch]
-            self._lose(trial, "tried alone")
         else:
             self._lose(trial, "given up")
 
     def _lose(self, trial: Trial, consequence: str) -> None:
         batch = _batch_of(trial)
-        own, limit_s = _id_of(batch), sum(map(time_limit_s, batch))
+        own, limit_s = _id_of(batch), time_limit_s(batch)
         self._ends[own] += 1
         if time.monotonic() - self._started.get(own, math.inf) >= limit_s:
             self._late.add(own)
@@ -191,7 +196,7 @@ class TrialCallback(tune.Callback):
         if own in self._late:
             cause = f"it may take {limit_s:.0f} s"
         if self._recorder is not None:
-            for part in batch:
+            for part in {part.task.key: part for part in batch}.values():  # once for each task
                 reason = f"its process ended ({cause}) {self._ends[own]} times"
                 self._recorder.lose(part, reason, consequence)
 

@@ -327,13 +327,37 @@ def _add_panels(a, panels, out) -> None:  # type: ignore[no-untyped-def]
             _add_tile(a, i, 0, panels[p], a.shape[1], out, i, p * panels.shape[2], False)
 
 
-def packed(network: nn.Module) -> nn.Module:
-    """Return a network with packed dense layers: a `Linear`, or an `nn.Sequential` that contains some.
+class PairedConvolution(nn.Module):
+    """A convolution whose output for one picture has the bits that it has in a batch.
 
-    Other layers are the same objects. The result runs on the CPU.
+    Torch computes a single picture with a kernel of up to 3 x 3 by other code than two.
+    """
+
+    def __init__(self, layer: nn.Conv2d) -> None:
+        """Use the layer, whose weights stay its own."""
+        super().__init__()
+        self._layer = layer
+
+    def forward(self, pictures: Tensor) -> Tensor:
+        """Return the layer's outputs (B, ...) of pictures (B, ...)."""
+        return (
+            self._layer(pictures.expand(2, *pictures.shape[1:]))[:1]
+            if len(pictures) == 1
+            else self._layer(pictures)
+        )
+
+
+def packed(network: nn.Module) -> nn.Module:
+    """Return a network for the CPU whose outputs have the same bits in a batch of any size.
+
+    Args:
+        network: A `Linear`, whose weights are packed; an `nn.Conv2d`; an `nn.Sequential` that contains some.
+            Other layers are the same objects.
     """
     if type(network) is Linear and network.weight.dtype == torch.float32:
         return PackedLinear(network)
+    if type(network) is nn.Conv2d:
+        return PairedConvolution(network)
     if type(network) is nn.Sequential:  # a subclass may compute something else
         return nn.Sequential(*map(packed, network))
     return network

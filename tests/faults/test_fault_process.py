@@ -155,9 +155,9 @@ def evaluate_part(part):
 """
 ITS_LIMIT = """
 whole_limit_s = time_limit_s
-def time_limit_s(part):
-    stands = (part.task.env.faults.sparsity, part.task.policy.group) == (0.5, "bytestream")
-    return 30.0 if stands else whole_limit_s(part)
+def time_limit_s(batch):
+    stands = [(part.task.env.faults.sparsity, part.task.policy.group) for part in batch]
+    return 30.0 if (0.5, "bytestream") in stands else whole_limit_s(batch)
 """
 
 

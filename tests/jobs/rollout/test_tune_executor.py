@@ -1,6 +1,9 @@
 import dataclasses
+import functools
+import os
 import pickle
 import shutil
+import signal
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -9,7 +12,9 @@ import pytest
 
 from jobs.rollout import tune_executor
 from jobs.rollout.executors import Part, Recorder, evaluate_part
+from jobs.rollout.scheduler import plan_parts
 from jobs.rollout.store import EpisodeStore
+from jobs.rollout.tasks import split
 from jobs.rollout.tune_executor import (
     BATCHES_PER_CORE,
     MAX_FAILURES,
@@ -18,6 +23,8 @@ from jobs.rollout.tune_executor import (
     TrialCallback,
     batches_of,
     policy_files,
+    run_trial,
+    run_with_tune,
     time_limit_s,
     with_files,
 )
@@ -77,7 +84,8 @@ def test_a_part_that_ends_after_its_limit_is_said_to_be_late(part, tell, recorde
 
 
 def test_a_longer_part_may_take_longer(part, tmp_path):
-    assert 900 < time_limit_s(part) < time_limit_s(first_part(sweep_config(tmp_path, trials=9)))
+    longer = first_part(sweep_config(tmp_path, trials=9))
+    assert 900 < time_limit_s((part,)) < time_limit_s((longer,)) < time_limit_s((part, longer)) < 1800
 
 
 def test_a_part_that_ray_ended_for_lack_of_memory_says_so(part, tell, recorder, tmp_path):
@@ -106,10 +114,52 @@ def test_a_batch_that_ends_its_process_is_tried_part_by_part(tmp_path, recorder)
     batch = first_part(sweep_config(tmp_path)), first_part(sweep_config(tmp_path, trials=1), "random")
     callback = TrialCallback(recorder)
     trial = SimpleNamespace(config={"trial": {"batch": batch}}, error_file=None)
-    for left in [[batch]] * MAX_FAILURES + [[(part,) for part in batch]]:
-        callback.on_trial_error(1, [], trial)
-        assert callback.take_unfinished() == left
+    callback.on_trial_error(1, [], trial)
+    assert callback.take_unfinished() == [(part,) for part in batch]
     assert all("its process ended" in recorder.reason(part) for part in batch)
+
+
+def test_the_end_of_a_process_counts_once_for_a_task(tmp_path, recorder):
+    config = sweep_config(tmp_path, trials=24)
+    batch = tuple(map(Part, split(planned(config, "straight").tasks[0])))
+    callback, trial = (
+        TrialCallback(recorder),
+        SimpleNamespace(config={"trial": {"batch": batch}}, error_file=None),
+    )
+    callback.on_trial_error(1, [], trial)
+    callback.on_trial_result(1, [], trial, {"outcomes": list(map(made_up, batch))})
+    assert len(batch) == 3
+    assert EpisodeStore(tmp_path / "sweep").result(planned(config, "straight").tasks[0]).restarts == 1
+
+
+@pytest.mark.system
+def test_a_batch_of_which_one_part_ends_its_process_leaves_the_episodes_of_each_alone(
+    tmp_path, recorder, monkeypatch
+):
+    config, store = (
+        sweep_config(tmp_path, axes={"rate": {"env.control_hz": [50, 70, 90]}}),
+        EpisodeStore(tmp_path / "sweep"),
+    )
+    parts = plan_parts(planned(config, "random").tasks, store, False)
+    ended = []
+    monkeypatch.setattr(tune_executor, "batches_of", lambda some, cores: [tuple(some[:2]), tuple(some[2:])])
+    monkeypatch.setattr(recorder, "lose", lambda part, *said: ended.append((part.task.key, said[1])))
+    first = parts[0].task.key
+    monkeypatch.setattr(
+        tune_executor, "run_trial", functools.partial(run_until, first, tmp_path / "was there")
+    )
+    run_with_tune(parts, recorder, config.cluster, tmp_path / "run")
+    for part in parts:
+        assert store.result(part.task).episodes.tobytes() == evaluate_part(part).episodes.tobytes()
+    assert {(part.task.key, "each part tried alone") for part in parts[:2]} == set(ended)
+
+
+def run_until(key, mark, params, files):
+    """Kill the process of the first batch that contains a task."""
+    if any(part.task.key == key for part in params["trial"]["batch"]) and not mark.exists():
+        mark.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    run_trial(params, files)
 
 
 def test_batches_hold_every_part_once_and_only_what_one_call_can_step(tmp_path):

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jobs.run.torch_threads import torch_threads
+from models.encoder.event_images import nature_layers
 from models.encoder.products import (
     DEPTH,
     HEIGHT,
@@ -208,3 +209,12 @@ def test_gradients_of_an_encoder_do_not_change_with_what_libraries_choose(change
         for more in ({}, changed)
     ]
     assert found[0] == found[1]
+
+
+def test_a_picture_alone_has_the_outputs_that_it_has_in_a_batch():
+    pictures = torch.rand(5, 3, 64, 64, generator=torch.Generator().manual_seed(0))
+    run = packed(torch.nn.Sequential(*nature_layers((3, 64, 64), 32)))
+    with torch.inference_mode(), torch_threads(1):
+        alone = torch.cat([run(one[None]) for one in pictures])
+        assert torch.equal(run(pictures), alone)
+        assert torch.equal(run(pictures[:2]), alone[:2])
