@@ -9,7 +9,7 @@ import csv
 import hashlib
 import io
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -20,8 +20,8 @@ from pydantic import Field
 
 from jobs.bench.protocol import Cell, Protocol
 from jobs.bench.score import Episodes, score
-from jobs.rollout.episodes import EPISODE
-from jobs.rollout.table import as_table
+from jobs.rollout.episodes import ADDED, EPISODE
+from jobs.rollout.table import as_table, episodes_of
 from jobs.run.files import RunError, read_json, write_atomic, write_json
 
 LABELS = ("Corruption", "Severity")
@@ -154,15 +154,17 @@ def _episodes_of(table: Path, text: str, protocol: Protocol, part: str) -> dict[
     """Parse the episodes of a CSV file by cell; require exactly one for each corridor of each cell."""
     cells = protocol.cells(part)
     rows = list(csv.reader(io.StringIO(text)))
-    _require(table, "columns", [*LABELS, *(EPISODE.names or ())], rows[0] if rows else [])
+    columns = rows[0][len(LABELS) :] if rows else []
+    known = [name for name in EPISODE.names or () if name in columns or name not in ADDED]
+    _require(table, "columns", [*LABELS, *known], rows[0] if rows else [])
     found: dict[Cell, list[tuple[Any, ...]]] = {cell: [] for cell in cells}
     for number, row in enumerate(rows[1:], 2):
         try:
-            cell, values = (row[0], int(row[1])), _values(row[2:])
+            cell, values = (row[0], int(row[1])), _values(row[2:], columns)
             found[cell].append(values)
         except (KeyError, ValueError, IndexError):
             raise RefusedResultError(f"{table}: line {number} must be an episode, got {row}") from None
-    arrays = {cell: np.array(values, EPISODE) for cell, values in found.items()}
+    arrays = {cell: episodes_of(values, columns) for cell, values in found.items()}
     for cell, episodes in arrays.items():
         if not np.array_equal(episodes["seed"], np.arange(protocol.corridors)):
             rule = f"must have the corridors 0 to {protocol.corridors - 1} once each, in their order"
@@ -170,9 +172,9 @@ def _episodes_of(table: Path, text: str, protocol: Protocol, part: str) -> dict[
     return arrays
 
 
-def _values(row: list[str]) -> tuple[Any, ...]:
-    """Parse the fields of an EPISODE; raise ValueError or KeyError if one is malformed or not finite."""
-    kinds = [EPISODE[name].kind for name in EPISODE.names or ()]
+def _values(row: list[str], columns: Sequence[str]) -> tuple[Any, ...]:
+    """Parse these fields of an EPISODE; raise ValueError or KeyError if one is malformed or not finite."""
+    kinds = [EPISODE[name].kind for name in columns]
     read: dict[str, Any] = {"b": {"True": True, "False": False}.__getitem__, "i": int, "f": float}
     values = tuple(read[kind](text) for text, kind in zip(row, kinds, strict=True))
     if not all(math.isfinite(value) for value in values):

@@ -61,6 +61,7 @@ METRICS = {
 ENV_STEPS = "num_env_steps_sampled_lifetime"
 SAMPLED = ("env_runners", "num_env_steps_sampled")
 LEARNER = ("learners", "default_policy")
+LEARNED_STEPS = "num_module_steps_trained"
 MODULE = Path("learner_group", "learner", "rl_module", "default_policy")
 MAX_FAILURES = 2
 CHECKPOINTS_KEPT = 3  # one more than Tune's state may name after a kill
@@ -341,7 +342,10 @@ def read_metrics(result: Mapping[str, object], seconds: float, algorithm: Algori
     steps = _lookup(result, SAMPLED)
     metrics["perf/env_steps_per_second"] = steps / seconds if seconds > 0 else math.nan
     updated: Any = result.get("learners", {})
-    told = [name for name, key in algorithm.losses.items() if key in updated.get(LEARNER[-1], {})]
+    learner = updated.get(LEARNER[-1], {})
+    # Without a gradient step in an iteration, RLlib's IMPALA reports NaN steps and NaN losses.
+    learned = not math.isnan(learner.get(LEARNED_STEPS, 0.0))
+    told = [name for name, key in algorithm.losses.items() if learned and key in learner]
     bad = [f"{name} = {metrics[name]}" for name in told if not math.isfinite(metrics[name])]
     if bad:
         where = f"at environment step {result[ENV_STEPS]}"

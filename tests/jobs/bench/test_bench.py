@@ -17,7 +17,7 @@ from jobs.bench.result import Cost, RefusedResultError, read_result
 from jobs.bench.score import failure_counts, score
 from jobs.config.config import ConfigError, parse
 from jobs.rollout.agents import make_agent
-from jobs.rollout.episodes import EPISODE, roll_out
+from jobs.rollout.episodes import ADDED, EPISODE, roll_out
 from jobs.rollout.policies import read_foreign, read_policy
 from jobs.rollout.store import PartResult
 from jobs.run.files import read_json, write_json
@@ -188,6 +188,17 @@ def test_a_table_that_lacks_an_episode_or_has_others_than_its_scores_is_refused(
     write_json(result[0], read_json(result[0]) | {"episodes": checksum})
     with pytest.raises(RefusedResultError, match=said):
         read_result(result[0], protocol)
+
+
+def test_a_result_from_before_a_column_of_episodes_is_read_with_its_default(protocol, result, monkeypatch):
+    table = result[0].with_suffix(".csv")
+    table.write_text("".join(line.rpartition(",")[0] + "\n" for line in table.read_text().splitlines()))
+    checksum = hashlib.sha256(table.read_bytes()).hexdigest()
+    write_json(result[0], read_json(result[0]) | {"episodes": checksum})
+    with pytest.raises(RefusedResultError, match="columns"):
+        read_result(result[0], protocol)
+    monkeypatch.setitem(ADDED, "dropped", 7)
+    assert all((rows["dropped"] == 7).all() for rows in read_result(result[0], protocol).episodes.values())
 
 
 def test_a_result_of_another_protocol_or_with_more_or_less_than_the_schema_is_refused(protocol, result):

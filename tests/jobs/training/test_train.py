@@ -50,6 +50,8 @@ def test_a_loss_that_is_not_finite_stops_the_training():
     for bad in (math.nan, math.inf):
         with pytest.raises(TrainingError, match=r"train/value_loss = .* at environment step 4096"):
             read_metrics(result(vf_loss=bad), 2.0, PPO)
+    told = read_metrics(result(vf_loss=math.nan, num_module_steps_trained=math.nan), 2.0, PPO)
+    assert math.isnan(told["train/value_loss"])  # an iteration without a gradient step, as of RLlib's IMPALA
 
 
 # What Ray's memory monitor writes, shortened.
