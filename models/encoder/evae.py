@@ -1,6 +1,6 @@
 """The event variational autoencoder (appendix A.1, B.2): events -> context -> latent -> event picture.
 
-With the target "proximity" it decodes the nearness of the obstacles ahead instead, which a simulator knows
+With the target "proximity" it decodes how near the obstacles ahead are, which a simulator knows
 but events alone do not determine.
 
 Loss of one batch, both terms on a stated scale:
