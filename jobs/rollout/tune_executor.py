@@ -42,9 +42,9 @@ SNAPSHOTS = {"TUNE_GLOBAL_CHECKPOINT_S": "3600"}  # [s]
 Files = Mapping[str, Mapping[str, bytes]]  # policy folder -> name -> content
 Batch = tuple[Part, ...]
 BatchId = tuple[tuple[str, int], ...]
-MAX_ROWS = 32  # of a batch, in lock-step: more gain little
-MAX_PIXELS = MAX_ROWS * 346 * 260  # of a batch's cameras: their memory in a worker
-BATCHES_PER_CORE = 8  # at least: with fewer, cores would wait for the last ones
+MAX_ROWS = 32  # most episodes of a batch, in lock-step; more would gain little
+MAX_PIXELS = MAX_ROWS * 346 * 260  # most pixels of a batch's cameras, which take a worker's memory
+BATCHES_PER_CORE = 8  # at least; with fewer, cores would idle at the end
 
 
 def batches_of(parts: Sequence[Part], cores: int) -> list[Batch]:

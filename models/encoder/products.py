@@ -330,21 +330,19 @@ def _add_panels(a, panels, out) -> None:  # type: ignore[no-untyped-def]
 class PairedConvolution(nn.Module):
     """A convolution whose output for one picture has the bits that it has in a batch.
 
-    Torch computes a single picture with a kernel of up to 3 x 3 by other code than two.
+    For kernels of up to 3 x 3, torch runs different code on one picture than on several.
     """
 
     def __init__(self, layer: nn.Conv2d) -> None:
-        """Use the layer, whose weights stay its own."""
+        """Run this layer, without a copy of its weights."""
         super().__init__()
         self._layer = layer
 
     def forward(self, pictures: Tensor) -> Tensor:
         """Return the layer's outputs (B, ...) of pictures (B, ...)."""
-        return (
-            self._layer(pictures.expand(2, *pictures.shape[1:]))[:1]
-            if len(pictures) == 1
-            else self._layer(pictures)
-        )
+        if len(pictures) != 1:
+            return self._layer(pictures)
+        return self._layer(pictures.expand(2, *pictures.shape[1:]))[:1]
 
 
 def packed(network: nn.Module) -> nn.Module:
