@@ -17,9 +17,9 @@ from envs.config import EnvConfig
 from jobs.config.conditions import axis_points
 from jobs.config.config import ConfigError
 from jobs.config.env_keys import env_with
+from jobs.rollout.met import was_met
 from jobs.rollout.policies import EvaluatedPolicy, with_own_parts
 from jobs.rollout.tasks import EvaluationTask, make_task
-from jobs.study.plan import was_met
 
 PROTOCOL = Path(__file__).with_name("eventpolicy_c_v1.yaml")
 CLEAN = "clean"

@@ -11,9 +11,9 @@ from envs.config import EnvConfig, settings_hash
 from jobs.config.conditions import NOMINAL, axis_points, moving_settings
 from jobs.config.config import Config, ConfigError
 from jobs.config.env_keys import env_with
+from jobs.rollout.met import was_met
 from jobs.rollout.policies import Differences, EvaluatedPolicy, own_sensor_differences, with_sensor
 from jobs.rollout.tasks import EvaluationTask, make_task, text_of
-from jobs.study.met import met
 from jobs.study.results import Condition, Value
 
 Axes = Mapping[str, Mapping[Value, Mapping[str, Any]]]  # axis -> value -> settings that it changes
@@ -169,14 +169,6 @@ def _met(tasks: Sequence[EvaluationTask]) -> frozenset[tuple[Condition, str]]:
         for task in tasks
         if was_met(task.policy, nominal[task.policy.name], task.env)
     )
-
-
-def was_met(policy: EvaluatedPolicy, nominal: EnvConfig, env: EnvConfig) -> bool:
-    """Whether the condition lies within the policy's training distribution; always False for baselines."""
-    if not policy.conditions:
-        return False
-    trained = with_sensor(EnvConfig(**policy.world), policy.sensor)
-    return met(policy.conditions, trained, nominal, env)
 
 
 def _changed_env(policy: EvaluatedPolicy, own: EnvConfig, axis: str, changes: Mapping[str, Any]) -> EnvConfig:

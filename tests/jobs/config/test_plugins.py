@@ -12,8 +12,8 @@ from jobs.config import plugins
 from jobs.config.conditions import axis_errors, condition_errors
 from jobs.config.config import ConfigError, as_dict, parse
 from jobs.config.env_keys import env_with
+from jobs.rollout.met import met
 from jobs.run.folder import run_name
-from jobs.study.met import met
 from tests.support.configs import compose, small_config
 
 HEAD = "from envs.config import ADDED_FAULTS\nfrom envs.scene.layouts import LAYOUTS, Layout, MeshLayout\n"

@@ -7,13 +7,13 @@ from envs.config import EnvConfig
 from jobs.config.conditions import axis_points
 from jobs.config.config import parse
 from jobs.config.env_keys import env_with
+from jobs.rollout.met import met
 from jobs.rollout.policies import find_study_policies
 from jobs.rollout.tasks import text_of
 from jobs.run.files import read_json
 from jobs.run.folder import locate_run
 from jobs.run.provenance import REPOSITORY
 from jobs.study.doses import read_doses
-from jobs.study.met import met
 from jobs.study.plan import plan_study
 from jobs.study.results import read_published
 from tests.support.configs import compose

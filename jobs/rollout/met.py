@@ -8,6 +8,7 @@ from envs.config import EnvConfig
 from envs.scene.layouts import LAYOUTS, Layout, with_overrides
 from jobs.config.conditions import WEIGHT
 from jobs.config.env_keys import ADDED_FAULT, ENV_KEYS, LAYOUT, env_with
+from jobs.rollout.policies import EvaluatedPolicy, with_sensor
 
 NO_CONDITION = (
     "renderer",
@@ -18,6 +19,14 @@ NO_CONDITION = (
     "faults.added",
 )
 COMPARED = [key for key in ENV_KEYS if key not in NO_CONDITION and not key.startswith("fidelity.")]
+
+
+def was_met(policy: EvaluatedPolicy, nominal: EnvConfig, env: EnvConfig) -> bool:
+    """Whether the condition lies within the policy's training distribution; always False for baselines."""
+    if not policy.conditions:
+        return False
+    trained = with_sensor(EnvConfig(**policy.world), policy.sensor)
+    return met(policy.conditions, trained, nominal, env)
 
 
 def met(
