@@ -17,7 +17,7 @@ import torch
 from benchmarks.throughput import composed
 from jobs.analysis.tables import show_table
 from jobs.measure.timing import interleaved
-from jobs.run.device import device_variables
+from jobs.run.device import LEARNER_DEVICE
 from jobs.run.progress import console
 from jobs.run.ray_cluster import start_ray
 from jobs.training.algorithms import build_algorithm
@@ -53,7 +53,7 @@ def trainings(folder: Path) -> dict[tuple[str, str], Callable[[], object]]:
             config = composed(f"algo={algorithm}", "model=event_image", "algo.lr_schedule=constant")
             # All four exist at once: with only two cores, Ray would let one of them wait forever.
             start_ray(replace(config.cluster, num_cpus=4), folder)
-            os.environ.update(device_variables(device))  # read when the learner is built, in this process
+            os.environ[LEARNER_DEVICE] = device  # read when the learner is built, in this process
             work[algorithm, device] = build_algorithm(config).build_algo().train
     return work
 

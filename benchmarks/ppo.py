@@ -24,8 +24,8 @@ from ray.rllib.algorithms.ppo.torch.ppo_torch_learner import PPOTorchLearner
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecEnv
 
-from benchmarks.throughput import composed
-from envs.config import EnvConfig, sensor_settings, settings_hash
+from benchmarks.throughput import composed, encoder_file
+from envs.config import EnvConfig
 from envs.corridor import CorridorEnv
 from jobs.analysis.tables import show_table
 from jobs.config.algorithms import AlgoConfig
@@ -38,7 +38,6 @@ from jobs.training.ppo.learner import PlainPPOLearner
 from jobs.training.pretrain import evae_settings
 from models.encoder.evae import EventVAE
 from models.encoder.table import EncoderTable
-from models.encoder.weights import save_encoder
 from models.kinds import KINDS
 from models.policy.features import push_features
 
@@ -173,14 +172,6 @@ def every_kind(folder: Path) -> dict[str, Callable[[], object]]:
         path = encoder_file(evae, folder) if evae else None
         work[name] = built(config, build_algorithm(config, path)).train
     return work
-
-
-def encoder_file(evae: EventVAE, folder: Path) -> Path:
-    """Write an encoder for the default sensor; return its file."""
-    sensor = sensor_settings(EnvConfig())
-    path = folder / f"{evae.settings.variant}.safetensors"
-    save_encoder(path, evae, {"sensor": sensor, "sensor_hash": settings_hash(sensor)})
-    return path
 
 
 def stable_baselines(config: Config, table: EncoderTable) -> PPO:

@@ -134,10 +134,7 @@ def loop_rows(evae: EventVAE, folder: Path) -> list[tuple[str, float]]:
     from jobs.training.algorithms import build_algorithm
     from jobs.training.sampling.env_runner import PlainEnvRunner
 
-    sensor = sensor_settings(CONFIG)
-    path = folder / "encoder.safetensors"
-    save_encoder(path, evae, {"sensor": sensor, "sensor_hash": settings_hash(sensor)})
-    config = composed()
+    config, path = composed(), encoder_file(evae, folder)
     algo = cast(AlgoConfig, config.algo)
     size = algo.train_batch_size_per_learner
     start_ray(config.cluster, folder)
@@ -153,6 +150,14 @@ def loop_rows(evae: EventVAE, folder: Path) -> list[tuple[str, float]]:
         "sampling: simulation, networks, episodes": lambda: runner.sample(num_timesteps=size),
     }
     return [(name, seconds / size) for name, seconds in interleaved(work).items()]
+
+
+def encoder_file(evae: EventVAE, folder: Path) -> Path:
+    """Write an encoder for the default sensor; return its file."""
+    sensor = sensor_settings(CONFIG)
+    path = folder / f"{evae.settings.variant}.safetensors"
+    save_encoder(path, evae, {"sensor": sensor, "sensor_hash": settings_hash(sensor)})
+    return path
 
 
 def composed(*words: str) -> Config:

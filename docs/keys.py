@@ -140,11 +140,7 @@ def kinds() -> dict[str, dict[str, tuple[object, str]]]:
     hints = typing.get_type_hints(Config, include_extras=True)
     del hints["own"]
     found: dict[str, dict[str, tuple[object, str]]] = {
-        "": {},
-        "env": {},
-        "camera": {},
-        "faults": {},
-        "fidelity": {},
+        name: {} for name in ("", "env", "camera", "faults", "fidelity")
     }
     for key, path in ENV_KEYS.items():
         owner = hints["env"]

@@ -35,7 +35,6 @@ BLOCKS = (
     re.compile(r"!\[[^\]]*\]\([^)]*\)"),
     re.compile(r"<[^>]+>"),
 )
-TREE = re.compile(r"^```\{toctree\}\n(.*?)^```", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\[([^\]]*)\]\([^)]*\)")
 ITEM = re.compile(r"^\s*(?:[-*]|\d+\.)\s+", re.MULTILINE)
 WORD = re.compile(r"[A-Za-z]+(?:'[a-z]+)?")

@@ -6,7 +6,7 @@ LIMIT_M = 1e6  # largest distance of a pose from the origin, per axis
 LIMIT_S = 1e9
 
 
-def check_image(width: int, height: int, fov_deg: float, samples: int, cull_m: float = math.inf) -> None:
+def check_image(width: int, height: int, fov_deg: float, samples: int, cull_m: float) -> None:
     """Raise ValueError unless sizes and samples are >= 1, fov_deg is in [1, 170] and cull_m positive."""
     if not (min(width, height, samples) >= 1 and 1.0 <= fov_deg <= 170.0):
         raise ValueError(
@@ -17,7 +17,7 @@ def check_image(width: int, height: int, fov_deg: float, samples: int, cull_m: f
         raise ValueError(f"cull_m must be > 0 m (inf: draw everything), got {cull_m!r}")
 
 
-def check_pose(pose: tuple[float, float, float, float], t_s: float = 0.0) -> None:
+def check_pose(pose: tuple[float, float, float, float], t_s: float) -> None:
     """Raise ValueError unless `pose` (x, y, z [m], yaw [rad]) is finite, above ground and within 1000 km."""
     x, y, z, yaw = pose
     # Each value separately: Python's max() may ignore a NaN.

@@ -168,21 +168,19 @@ class CorridorEnv(gymnasium.Env):
     def begin(self, seed: int | None, options: Mapping[str, object] | None) -> None:
         """Start an episode like `reset`, but do not compute the observation."""
         super().reset(seed=seed)
-        number, split = self.series[1], self._nominal.split
         if seed is None and self.series[0] is None:
             seed = int(self.np_random.integers(kinematics.SEED_STRIDE))
-        number = kinematics.choose_episode(0 if seed is not None else number + 1, options or {})
+        number = kinematics.choose_episode(0 if seed is not None else self.series[1] + 1, options or {})
         self.series = self.series[0] if seed is None else int(seed), number
-        streams = kinematics.random_streams(split, self.series[0] or 0, number)
+        streams = kinematics.random_streams(self._nominal.split, self.series[0] or 0, number)
         scene_rng, spawn_rng, faults_rng, condition_rng = streams
         if self._draw is not None:
             self._set_config(self._draw(self._nominal, condition_rng))
         config = self.config
         vehicle = config.vehicle_radius_m, config.camera_height_m
         self.scene = make_scene(config.scene, scene_rng, *vehicle, **config.layout)
-        spawn_x = float(spawn_rng.uniform(*self.scene.spawn_range_m))
-        self._sensor.reset(self.scene, (spawn_x, 0.0), faults_rng)
-        spawn = spawn_x, 0.0
+        spawn = float(spawn_rng.uniform(*self.scene.spawn_range_m)), 0.0
+        self._sensor.reset(self.scene, spawn, faults_rng)
         self._actions = []
         self._vehicles.start(self._row, config, self.scene, self._sensor, spawn, self.dynamics)
 

@@ -21,8 +21,6 @@ from envs.raycast import RaycastRenderer
 from envs.raycast.stretches import Shifts
 from envs.scene import CONE, ELLIPSOID, OBSTACLE, Scene
 
-RENDERERS = ("auto", "raycast", "pyrender", "spheres")
-
 CULL_M = 143.0  # at tolerance 0.05: obstacles farther away add a twentieth of the tolerance
 RENDERS_TEXTURED = 1.3  # factor against a plain scene; for bodies only if their pattern has edges
 # Largest motion of an edge between two looks, at tolerance 0.05 in a control step of 0.1 m [pixels].
@@ -90,11 +88,9 @@ def choose_renderer(name: str, scene: Scene) -> str:
     """Return the renderer called `name`; "auto" is the cheapest that can draw `scene`.
 
     Raises:
-        ValueError: The name is unknown, or the renderer cannot draw the scene. The ray caster cannot draw
-            meshes, pyrender no moving bodies, "spheres" only plain spheres above plain ground.
+        ValueError: The renderer cannot draw the scene. The ray caster cannot draw meshes, pyrender no moving
+            bodies, "spheres" only plain spheres above plain ground.
     """
-    if name not in RENDERERS:
-        raise ValueError(f"renderer must be one of {RENDERERS}; got {name!r}.")
     if name == "pyrender" and scene.movers:
         raise ValueError("renderer='pyrender' cannot draw bodies that move; use 'auto'.")
     if name == "raycast" and scene.mesh is not None:
@@ -119,24 +115,13 @@ def make_renderer(chosen: RenderPlan, scene: Scene, width: int, height: int, fov
     return make(scene, width, height, fov_deg, samples=chosen.samples, cull_m=chosen.cull_m)
 
 
+@numba.njit(cache=True, error_model="numpy")
 def sub_renders(step_m: float, max_step_m: float) -> int:
     """Return the number of equal parts, one render each, into which to cut a way, none above `max_step_m`.
 
     It is at least 1, also for a step of 0 m. A step that exceeds a multiple of `max_step_m` by
     rounding alone (relative 1e-9) is not divided further.
-
-    Raises:
-        ValueError: step_m is negative or not finite, or max_step_m is not positive.
     """
-    if not (0.0 <= step_m < math.inf and max_step_m > 0.0):
-        raise ValueError(f"step_m must be finite and >= 0, max_step_m > 0; got {step_m}, {max_step_m}")
-    parts: int = parts_of(step_m, max_step_m)
-    return parts
-
-
-@numba.njit(cache=True, error_model="numpy")
-def parts_of(step_m: float, max_step_m: float) -> int:
-    """Compute `sub_renders` without checks."""
     return max(1, math.ceil(step_m / max_step_m * (1.0 - 1e-9)))
 
 

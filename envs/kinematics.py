@@ -114,31 +114,17 @@ def planned_position(spawn_x_m: float, moves: tuple[int, int, int], step_m: tupl
 
 
 @numba.njit(cache=True, error_model="numpy")
-def advance(lane: Lane, sections: np.ndarray, start: Point, planned: Point) -> Outcome:
+def advance(
+    lane: Lane, still_and_moving: tuple, shares: tuple[float, float], start: Point, planned: Point
+) -> Outcome:
     """Move from `start` towards `planned` until the first contact or the goal line (appendix D.1.1).
 
     Contact and goal at the same place is a collision; so is a start in contact.
 
     Args:
         lane: `Lane`.
-        sections: (M, 7), sections of the standing bodies, from `envs.scene.Scene.sections`.
-        start: x and y [m].
-        planned: x and y [m].
-    """
-    segment = start[0], start[1], planned[0], planned[1]
-    contact = first_contact(segment, lane.radius_m, lane.half_width_m, sections)
-    return _until(lane, contact, start, planned)
-
-
-@numba.njit(cache=True, error_model="numpy")
-def advance_among(
-    lane: Lane, still_and_moving: tuple, shares: tuple[float, float], start: Point, planned: Point
-) -> Outcome:
-    """Do the same as `advance`, with moving bodies.
-
-    Args:
-        lane: `Lane`.
-        still_and_moving: Standing sections, (M, 7), and moving sections as for `first_moving_contact`.
+        still_and_moving: Sections of the standing bodies, (M, 7), from `envs.scene.Scene.sections`, and
+            moving sections as for `first_moving_contact`.
         shares: Fractions of the control step that have passed at `start` and at `planned`.
         start: x and y [m].
         planned: x and y [m].
@@ -147,12 +133,6 @@ def advance_among(
     segment = start[0], start[1], planned[0], planned[1]
     contact = first_contact(segment, lane.radius_m, lane.half_width_m, sections)
     contact = min(contact, first_moving_contact(segment, lane.radius_m, moving, shares))
-    return _until(lane, contact, start, planned)
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _until(lane: Lane, contact: float, start: Point, planned: Point) -> Outcome:
-    """Move from `start` towards `planned` until `contact`, a share of the way, or the goal line."""
     goal = math.inf
     if planned[1] > start[1]:  # a vehicle that stands or flies back does not reach the goal line
         goal = (lane.length_m - start[1]) / (planned[1] - start[1])
@@ -174,17 +154,17 @@ def follow(lane: Lane, still_and_moving: tuple, way: np.ndarray) -> Outcome:
 
     Args:
         lane: `Lane`.
-        still_and_moving: As for `advance_among`.
+        still_and_moving: As for `advance`.
         way: (N + 1, 2), places at the ends of the N parts [m].
     """
     last, parts = len(way) - 1, 0
     places = (way[0, 0], way[0, 1]), (way[1, 0], way[1, 1])
-    outcome = advance_among(lane, still_and_moving, (0.0, 1.0 / last), *places)
+    outcome = advance(lane, still_and_moving, (0.0, 1.0 / last), *places)
     while parts < last - 1 and not (outcome.success or outcome.collision):
         parts += 1
         start = way[parts, 0], way[parts, 1]
         end, shares = (way[parts + 1, 0], way[parts + 1, 1]), (parts / last, (parts + 1) / last)
-        outcome = advance_among(lane, still_and_moving, shares, start, end)
+        outcome = advance(lane, still_and_moving, shares, start, end)
     end, success, collision = outcome.end, outcome.success, outcome.collision
     reward = end[1] - way[0, 1] + GOAL_REWARD * success + COLLISION_REWARD * collision
     return Outcome(end, (parts + outcome.share) / last, reward, success, collision)

@@ -22,11 +22,10 @@ def run(config: Config) -> dict[str, float]:
     """Run every stage that the policy needs and that is not done yet, and return the evaluation's metrics."""
     check_inputs(config)
     folder = open_run(config)
-    config = folder.config
     console.print(f"Run folder: {folder.path}")
-    with open_tracker(config, folder) as tracker:
+    with open_tracker(folder.config, folder) as tracker:
         train(folder, prepare_inputs(folder, tracker), tracker.log)
-        metrics = evaluate(config, folder, tracker)
+        metrics = evaluate(folder, tracker)
         console.print(f"Registered: {register_training(tracker, folder.path)}")
         console.print(tracker.dashboard())
     return metrics

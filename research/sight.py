@@ -66,7 +66,7 @@ def fly(env: CorridorEnv, seed: int, sight_m: float, view_deg: float) -> bool:
             return bool(info["success"])
 
 
-def rows_of(world: Path, radius_m: float, starts: int, speed_mps: float = 10.0) -> list[tuple[str, str, str]]:
+def rows_of(world: Path, radius_m: float, starts: int) -> list[tuple[str, str, str]]:
     """Return a row under `HEAD` for each view and sight; five heights, `starts` starts at each."""
     rows = []
     for view_deg in VIEWS_DEG:
@@ -76,7 +76,7 @@ def rows_of(world: Path, radius_m: float, starts: int, speed_mps: float = 10.0) 
                 config = EnvConfig(
                     scene=str(world),
                     layout={"passable": False},
-                    speed_mps=speed_mps,
+                    speed_mps=10.0,
                     control_hz=100.0,
                     camera_height_m=height_m,
                     vehicle_radius_m=radius_m,

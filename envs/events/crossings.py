@@ -22,7 +22,7 @@ import numba
 import numpy as np
 
 from envs.compiled import inlined, kernel
-from envs.events.emission import EVENT, Span, Trains, events_of, limit_events
+from envs.events.emission import EVENT, Span, Trains, concatenated, events_of, limit_events
 from envs.events.photoreceptor import MAX_LUMINANCE, Curve, light_of, respond
 from envs.events.refractory import (
     TOLERANCE,
@@ -299,11 +299,7 @@ def steps(frames, times_us, width, limit, model, memory, scratch):
         dropped, total = dropped + lost, total + events.size
     if len(batches) == 1:
         return -1, dropped, batches[0]
-    joined, first = np.empty(total, EVENT), 0
-    for events in batches:
-        joined[first : first + events.size] = events
-        first += events.size
-    return -1, dropped, joined
+    return -1, dropped, concatenated(batches, total)
 
 
 @numba.njit(cache=True, error_model="numpy")

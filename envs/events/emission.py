@@ -138,6 +138,16 @@ def sorted_events(times, places, span):
 
 
 @numba.njit(cache=True, error_model="numpy")
+def concatenated(parts, total):
+    """Concatenate EVENT arrays with `total` events in all."""
+    together, size = np.empty(total, EVENT), 0
+    for events in parts:
+        together[size : size + events.size] = events
+        size += events.size
+    return together
+
+
+@numba.njit(cache=True, error_model="numpy")
 def _emitted(trains, interval, width, total):
     """Return times [us since the last frame] and places (y << 13 | x << 1 | ON) of all events, by pixel."""
     times, places = np.empty(total, np.int64), np.empty(total, np.uint32)

@@ -25,11 +25,12 @@ from envs.events.camera import MAX_EVENTS_PER_FRAME
 from envs.events.disturbances import disturb
 from envs.events.emission import EVENT
 from envs.events.noise_labels import NoiseLabels
-from envs.events.pixel_noise import PixelNoise, PixelState, fire, no_noise
+from envs.events.pixel_noise import PixelState, draw_noise, fire, kept_noise, no_noise
 from envs.events.readout import Readout
 
 LABELLED = np.dtype([*EVENT.descr, ("is_noise", "?")])
 NO_BURSTS, NOTHING_FIRED = np.zeros((0, 2), np.int64), np.zeros((3, 0), np.int64)
+NO_PIXELS = np.empty(0, np.int64)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,11 +82,7 @@ class FaultState(NamedTuple):
 
 
 def fault_state(
-    faults: FaultsConfig,
-    pixels: PixelFaults,
-    rng: np.random.Generator,
-    noise: PixelState | None = None,
-    numbers: np.ndarray | None = None,
+    faults: FaultsConfig, pixels: PixelFaults, noise: PixelState, numbers: np.ndarray = NO_PIXELS
 ) -> FaultState:
     """Return the faults of one camera for compiled code; `numbers` are the flat pixels of `noise`."""
     rates = Rates(
@@ -96,10 +93,8 @@ def fault_state(
         float(faults.hot_pixel_hz),
         float(faults.burst_activity_hz),
     )
-    state = no_noise(rng) if noise is None else noise
-    of_noise = np.empty(0, np.int64) if numbers is None else numbers
     is_on = faults != FaultsConfig()
-    return FaultState(is_on, state, of_noise, pixels.dead, pixels.live, pixels.hot, rates, np.zeros(1))
+    return FaultState(is_on, noise, numbers, pixels.dead, pixels.live, pixels.hot, rates, np.zeros(1))
 
 
 def draw_pixel_faults(shape: tuple[int, int], faults: FaultsConfig, rng: np.random.Generator) -> PixelFaults:
@@ -127,7 +122,7 @@ def draw_pixel_faults(shape: tuple[int, int], faults: FaultsConfig, rng: np.rand
 def _no_faults() -> FaultState:
     """Return the state of a camera without faults."""
     rng, faults = np.random.default_rng(0), FaultsConfig()
-    return fault_state(faults, draw_pixel_faults((2, 2), faults, rng), rng)
+    return fault_state(faults, draw_pixel_faults((2, 2), faults, rng), no_noise(rng))
 
 
 NO_FAULTS = _no_faults()
@@ -190,21 +185,21 @@ class RealSensor:
         Raises:
             ValueError: The pixels are too slow for the rate of shot noise.
         """
-        self._faults, self._rng, self.lost = faults, rng, 0
+        self._faults, self.lost = faults, 0
         self._labels, self.is_noise = labels, np.empty(0, bool)
         shape = camera.height, camera.width
         self._pixels = draw_pixel_faults(shape, faults, rng)
-        self._noise = self._readout = self._noise_labels = None
-        alive = None
+        own, numbers = state
+        self._model, self._memory, _ = own
+        self._readout = self._noise_labels = None
+        noise, alive = no_noise(rng), NO_PIXELS
         if faults.shot_noise_hz > 0.0 or faults.leak_hz > 0.0:
-            own, numbers = state
             rest = own[1][1]["first_level"].copy()  # before the noise moves the levels
             alive = np.where(self._pixels.dead.flat[numbers], -1, numbers)
-            self._noise = PixelNoise(camera, faults, own, alive, t_us, rng)
+            noise = draw_noise(camera, faults, own, alive, t_us, rng)
             if labels:
                 self._noise_labels = NoiseLabels(own, numbers, rest)
-        noise = None if self._noise is None else self._noise.state
-        self.state = fault_state(faults, self._pixels, rng, noise, alive)
+        self.state = fault_state(faults, self._pixels, noise, alive)
         bursts = faults.burst_hz > 0.0 and faults.burst_ms > 0.0 and faults.burst_activity_hz > 0.0
         self._bursts = Bursts(faults, t_us, rng) if bursts else None
         if has_readout(camera):
@@ -227,9 +222,9 @@ class RealSensor:
         Call it after the camera has seen the light of t1_us. Raises the same errors as `apply_faults`.
         """
         noise, labels, shape = NOTHING_FIRED, None, self._pixels.dead.shape
-        kept = self._noise.kept() if self._noise_labels is not None and self._noise is not None else None
-        if self._noise is not None:
-            noise = self._noise.events(t0_us, t1_us)
+        kept = kept_noise(self.state.noise) if self._noise_labels is not None else None
+        if self.state.numbers.size > 0:
+            noise = fire(t0_us, t1_us, self._model, self._memory, self.state.noise)
         if self._noise_labels is not None and kept is not None:
             pixels, fired = events["y"].astype(np.int64) * shape[1] + events["x"], noise[1:]
             told = self.state.numbers[fired[0]], fired[1]
@@ -240,7 +235,7 @@ class RealSensor:
         events, is_noise = _with_faults(events, span, self._faults, self.state, noise, labels, bursts)
         for name, apply in self._added.items():
             before, events = events, apply(events, t0_us, t1_us)
-            _check_added(name, events, (t0_us, t1_us), shape)
+            _check_added(name, events, span, shape)
             if self._labels:
                 is_noise = ~np.isin(events, before[~is_noise])
         if not self._labels:
@@ -324,7 +319,8 @@ def apply_faults(
     Raises:
         ValueError: The interval is empty, or more than 2**24 false events are expected.
     """
-    return _with_faults(events, (t0_us, t1_us), faults, fault_state(faults, pixels, rng), NOTHING_FIRED)[0]
+    state = fault_state(faults, pixels, no_noise(rng))
+    return _with_faults(events, (t0_us, t1_us), faults, state, NOTHING_FIRED)[0]
 
 
 def _with_faults(

@@ -218,68 +218,51 @@ def no_noise(rng: np.random.Generator) -> PixelState:
     return PixelState(rows, Process(0.0, 1.0, np.zeros(2), 0.0, 1.0), rng, _scratch(0))
 
 
-class PixelNoise:
-    """Leakage and shot noise of one camera's pixels.
+def draw_noise(
+    camera: CameraConfig,
+    faults: FaultsConfig,
+    state: tuple,
+    numbers: np.ndarray,
+    t_us: int,
+    rng: np.random.Generator,
+) -> PixelState:
+    """Draw the noise of a camera that has just seen its first frame; levels start at random places.
 
-    Attributes:
-        state: `PixelState`.
+    Args:
+        camera: Settings of the camera.
+        faults: Settings of the noise.
+        state: `EventCamera.state` of the camera.
+        numbers: int64 (N,), the flat pixel y * W + x of each pixel of its memory; -1: dead.
+        t_us: The time of the first frame [us].
+        rng: Source of all draws.
+
+    Raises:
+        ValueError: The bandwidth of the pixels is too low for `shot_noise_hz`.
     """
+    size, alive = numbers.size, numbers >= 0
+    tau_s = 1.0 / (2.0 * math.pi * (camera.cutoff_hz or DEFAULT_BANDWIDTH_HZ))
+    spread = alive * 10.0 ** (faults.noise_spread * rng.standard_normal(size))
+    sigma, shot = 0.0, np.zeros(size)
+    if faults.shot_noise_hz > 0.0:
+        sigma = 1.0 / threshold_in_sigmas(faults.shot_noise_hz * tau_s)
+        shot = spread
+    rates = np.append(1.0 / np.maximum(passage_times(), 1.0 / PER_SIGMA), 0.0) * (1e-6 / tau_s)
+    slice_us = 1e6 * SLICE / max(faults.leak_hz, 1e-9)
+    process = Process(sigma, 1e6 * tau_s, rates, float(faults.leak_jitter), slice_us)
+    leak = faults.leak_hz * spread
+    rows, seen = np.zeros((size, 9)), np.zeros((2, size), np.float32)
+    rows[:, 0] = leak / np.maximum(1.0 + faults.leak_jitter * rng.standard_normal(size), 0.1)
+    rows[:, 1], rows[:, 2], rows[:, 3] = leak, shot, rng.standard_exponential(size)
+    rows[:, 4], rows[:, 6], rows[:, 7], seen[1] = t_us, t_us, -np.inf, np.nan
+    due_us, kept_us = np.full(size, float(t_us)), np.full(size, np.iinfo(np.int64).min)
+    move_levels(state[0], state[1], -rng.random(size) * alive)
+    return PixelState((rows, seen, due_us, kept_us), process, rng, _scratch(size))
 
-    def __init__(
-        self,
-        camera: CameraConfig,
-        faults: FaultsConfig,
-        state: tuple,
-        numbers: np.ndarray,
-        t_us: int,
-        rng: np.random.Generator,
-    ) -> None:
-        """Draw the noise of a camera that has just seen its first frame; levels start at random places.
 
-        Args:
-            camera: Settings of the camera.
-            faults: Settings of the noise.
-            state: `EventCamera.state` of the camera.
-            numbers: int64 (N,), the flat pixel y * W + x of each pixel of its memory; -1: dead.
-            t_us: The time of the first frame [us].
-            rng: Source of all draws.
-
-        Raises:
-            ValueError: The bandwidth of the pixels is too low for `shot_noise_hz`.
-        """
-        self._model, self._memory, _ = state
-        size, alive = numbers.size, numbers >= 0
-        tau_s = 1.0 / (2.0 * math.pi * (camera.cutoff_hz or DEFAULT_BANDWIDTH_HZ))
-        spread = alive * 10.0 ** (faults.noise_spread * rng.standard_normal(size))
-        sigma, shot = 0.0, np.zeros(size)
-        if faults.shot_noise_hz > 0.0:
-            sigma = 1.0 / threshold_in_sigmas(faults.shot_noise_hz * tau_s)
-            shot = spread
-        rates = np.append(1.0 / np.maximum(passage_times(), 1.0 / PER_SIGMA), 0.0) * (1e-6 / tau_s)
-        slice_us = 1e6 * SLICE / max(faults.leak_hz, 1e-9)
-        process = Process(sigma, 1e6 * tau_s, rates, float(faults.leak_jitter), slice_us)
-        leak = faults.leak_hz * spread
-        rows, seen = np.zeros((size, 9)), np.zeros((2, size), np.float32)
-        rows[:, 0] = leak / np.maximum(1.0 + faults.leak_jitter * rng.standard_normal(size), 0.1)
-        rows[:, 1], rows[:, 2], rows[:, 3] = leak, shot, rng.standard_exponential(size)
-        rows[:, 4], rows[:, 6], rows[:, 7], seen[1] = t_us, t_us, -np.inf, np.nan
-        due_us, kept_us = np.full(size, float(t_us)), np.full(size, np.iinfo(np.int64).min)
-        self.state = PixelState((rows, seen, due_us, kept_us), process, rng, _scratch(size))
-        move_levels(self._model, self._memory, -rng.random(size) * alive)
-
-    def events(self, t0_us: int, t1_us: int) -> np.ndarray:
-        """Return the noise events of (t0_us, t1_us]; call it after the camera has seen the light of t1_us.
-
-        Returns:
-            As `fire`.
-        """
-        fired: np.ndarray = fire(t0_us, t1_us, self._model, self._memory, self.state)
-        return fired
-
-    def kept(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return copies of `Noise.kept` and `Noise.kept_us`."""
-        rows, _, _, kept_us = self.state.rows
-        return rows[:, 8].copy(), kept_us.copy()
+def kept_noise(state: PixelState) -> tuple[np.ndarray, np.ndarray]:
+    """Return copies of `Noise.kept` and `Noise.kept_us`."""
+    rows, _, _, kept_us = state.rows
+    return rows[:, 8].copy(), kept_us.copy()
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -167,7 +167,8 @@ def _level_part(
 def _rows_between(row: int, top: Ends, bottom: Ends) -> Rows:
     """Return the range of rows of the part of a pixel row between the middles of two edges."""
     high, low = 0.5 * (top.left + top.right), 0.5 * (bottom.left + bottom.right)
-    return Rows(min(max(high, row), low), max(min(low, row + 1.0), high))
+    start, end = min(max(high, row), low), max(min(low, row + 1.0), high)
+    return Rows(start, max(start, end))
 
 
 @kernel
@@ -179,8 +180,7 @@ def texture_level(canvas: Canvas, top: Ends, bottom: Ends, height: float) -> Non
     for row in range(int(min(top.left, top.right)), int(max(bottom.left, bottom.right)) + 1):
         share = share_below(row, top) - share_below(row, bottom)
         if share > 0.0:
-            start, end = _rows_between(row, top, bottom)
-            rows = Rows(start, max(start, end))
+            rows = _rows_between(row, top, bottom)
             mean = _level_row(canvas, frame.body_texture, rows, height, strip.slope, wide)
             canvas.accumulators[Layer.PAINT, row] += weight * share * mean
 
@@ -197,8 +197,7 @@ def texture_side(canvas: Canvas, body: Record, top: Ends, bottom: Ends) -> None:
     for row in range(int(min(top.left, top.right)), beyond):
         share = share_below(row, top) - share_below(row, bottom)
         if share > 0.0 and not whole <= row < rest:
-            start, end = _rows_between(row, top, bottom)
-            mean = _upright_row(canvas, look, side, Rows(start, max(start, end)))
+            mean = _upright_row(canvas, look, side, _rows_between(row, top, bottom))
             canvas.accumulators[Layer.PAINT, row] += weight * share * mean
     _add_upright_rows(canvas, look, side, whole, rest, weight)
 

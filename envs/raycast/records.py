@@ -58,7 +58,6 @@ FRAME = _record(
 BODY = _record(
     [
         ("kind", "i8"),  # POLE, CONE, ELLIPSOID or BOX
-        ("number", "i8"),  # its index among the bodies of the scene
         *_floats("x", "y", "bottom", "top", "rx", "ry", "albedo"),
         ("turn", "f8"),  # metres of texture per radian around it
         # Whether it moves; if so, its velocity [m/s], and the time of the place above [s].

@@ -25,12 +25,6 @@ from envs.scene.paths import bodies_at
 from envs.scene.textures import PATTERNS, around
 
 
-def _check_scene(scene: Scene) -> None:
-    """Raise ValueError if the scene has a mesh, which only pyrender draws."""
-    if scene.mesh is not None:
-        raise ValueError("raycast draws no meshes, and the scene has one; use pyrender")
-
-
 def _make_bodies(scene: Scene) -> np.ndarray:
     """Return the parts of obstacles above the ground, (M,) BODY; moving bodies come last."""
     o = scene.obstacles[scene.obstacles["z"] + scene.obstacles["rz"] > 0.0]
@@ -41,7 +35,6 @@ def _make_bodies(scene: Scene) -> np.ndarray:
     bodies = np.zeros(len(o), BODY)
     for name in ("kind", "x", "y", "rx", "ry", "albedo"):
         bodies[name] = o[name]
-    bodies["number"] = np.arange(len(o))
     bodies["rx"][cut] *= (top / (top - bottom))[cut]
     bodies["bottom"], bodies["top"] = np.where(sunk, 0.0, bottom), top
     bodies["turn"] = [around(scene.obstacle_texture, radius) for radius in o["rx"].tolist()]
@@ -56,7 +49,7 @@ def _make_frame(scene: Scene, height: int, focal: float, samples: int) -> tuple[
     lit = scene.shade(np.ones(6), faces).tolist()
     frame["horizon"], frame["focal"], frame["samples"] = 0.5 * height, focal, samples
     frame["sky"], frame["floor"] = scene.sky_luminance, scene.shade(scene.ground_albedo, faces[0])
-    tops = [*(scene.obstacles["z"] + scene.obstacles["rz"]).tolist()]
+    tops = (scene.obstacles["z"] + scene.obstacles["rz"]).tolist()
     tops += [float(one.places_m[:, 2].max() + one.body["rz"]) for one in scene.movers]
     frame["tallest"] = max([scene.wall_height_m, *tops])
     frame["wall_half"], frame["wall_top"] = 0.5 * scene.width_m, scene.wall_height_m
@@ -129,7 +122,8 @@ class RaycastRenderer:
 
     def set_scene(self, scene: Scene) -> None:
         """Draw `scene` from now on. Raises ValueError if it has something that this renderer cannot draw."""
-        _check_scene(scene)
+        if scene.mesh is not None:
+            raise ValueError("raycast draws no meshes, and the scene has one; use pyrender")
         self.bodies = _make_bodies(scene)
         focal = focal_length(self.width, self.fov_deg)
         self.frame, waves = _make_frame(scene, self.height, focal, self.samples)

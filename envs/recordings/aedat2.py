@@ -81,7 +81,7 @@ def _header(request: Request) -> tuple[int, str]:
     return start, chip
 
 
-def _camera(request: Request, chip: str, start: int, count: int) -> tuple[int, int, bool]:
+def _camera(request: Request, chip: str, start: int, count: int) -> tuple[int | None, int | None, bool]:
     """Return width, height and whether the camera is a DAVIS."""
     for name, size in DAVIS_SIZES.items():
         if name in chip.upper():
@@ -90,7 +90,7 @@ def _camera(request: Request, chip: str, start: int, count: int) -> tuple[int, i
     if chip.endswith("DVS128") or given == DVS128_SIZE:
         return *DVS128_SIZE, False
     if not chip and given in DAVIS_SIZES.values():
-        return *next(size for size in DAVIS_SIZES.values() if size == given), True
+        return *given, True
     is_wide = not chip and any(
         part["address"].max() >= 1 << 16 for part in mapped_parts(request, start, ENTRY, count)
     )

@@ -56,8 +56,7 @@ def read_aedat3(request: Request) -> Opened:
     source = request.stream if request.stream is not None else next(iter(sources), None)
     name = header.sources.get(source, "").upper() if source is not None else ""
     size = next(((w, h) for known, w, h in SIZES if name.startswith(known)), (None, None))
-    if None not in size:
-        request = request.sized(*size)
+    request = request.sized(*size)
     return Opened("aedat3", request, gathered(request, EVENT, _packets(request, header, source)))
 
 

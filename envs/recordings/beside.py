@@ -72,22 +72,23 @@ class NoFramesError(ValueError):
 
 def has_frames(path: str | Path) -> bool:
     """Whether the format of a file supports frames in addition to events."""
-    path = Path(path)
-    if is_bag_folder(path):
-        return True
-    check_file(path, MAX_BYTES)
     try:
-        return recognised(path) in FRAMES
+        return _kind(Path(path)) in FRAMES
     except ValueError:
         return False
 
 
+def _kind(path: Path) -> str:
+    """Return the format of a file, or of the folder of a bag."""
+    if is_bag_folder(path):
+        return "ros"
+    check_file(path, MAX_BYTES)
+    return recognised(path)
+
+
 def _reader(table: Mapping[str, Callable[[Request], Any]], what: str, path: Path) -> Callable[[Request], Any]:
     """Return the function for the format of a file."""
-    if is_bag_folder(path):
-        return table["ros"]
-    check_file(path, MAX_BYTES)
-    kind = recognised(path)
+    kind = _kind(path)
     if kind not in table:
         raise ValueError(f"{path}: {kind} files have no {what}; {', '.join(table)} files have them")
     return table[kind]

@@ -168,13 +168,12 @@ def _paired(path: Path, pictures: IO[bytes], lines: queue.SimpleQueue) -> Iterat
         raise ValueError(f"{path}: is damaged or truncated ({said}); copy or encode it again")
 
 
-def _next_line(path: Path, lines: queue.SimpleQueue) -> str | None:
+def _next_line(path: Path, lines: queue.SimpleQueue[str | None]) -> str | None:
     """Return the next line that ffmpeg prints."""
     try:
-        line: str | None = lines.get(timeout=FRAME_TIMEOUT_S)
+        return lines.get(timeout=FRAME_TIMEOUT_S)
     except queue.Empty:
         raise ValueError(f"{path}: no frame came in {FRAME_TIMEOUT_S:.0f} s; encode it again") from None
-    return line
 
 
 def _time_us(path: Path, ticks: str, second: Fraction | None) -> int:

@@ -360,7 +360,7 @@ def assemble(
             values = values.astype(np.float64)  # float16 ends at 65504
         fits = (values >= 0) & (values < limit)  # NaN and infinity do not
         bad = len(values) - np.count_nonzero(fits)
-        if bad > max(1, len(values) // 10) or bad == len(values):
+        if bad > max(1, len(values) // 10) or bad == len(values) > 0:
             _refuse_column(request, name, values, fits, limit)
         good &= fits
         columns[name] = values
@@ -411,9 +411,7 @@ def _labels(request: Request, is_noise: np.ndarray) -> np.ndarray:
 
 
 def _refuse_column(request: Request, name: str, values: np.ndarray, fits: np.ndarray, limit: int) -> None:
-    """Raise the error for a column with too many invalid values; return if it has none."""
-    if fits.all():
-        return
+    """Raise the error for a column with too many invalid values."""
     first = int(np.argmin(fits))
     remedy = "coordinates count from 0"
     if name == "t":

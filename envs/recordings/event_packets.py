@@ -93,7 +93,7 @@ def _libcaer(packet: EventPacket, tally: Tally) -> np.ndarray:
     """Return the columns of libcaer's polarity events, whose 31-bit clock may wrap within a packet."""
     words = _whole(packet.body, ROW, tally)
     low = words["t"].astype(np.int64)
-    turns = np.concatenate(([0], np.cumsum(np.diff(low) < 0))) if len(low) else low
+    turns = np.cumsum(np.diff(low, prepend=low[:1]) < 0)
     t_us = packet.time_base_ns // 1000 + (turns << 31) + low
     data = words["data"].astype(np.int64)
     return np.stack((t_us, data >> 17 & 0x7FFF, data >> 2 & 0x7FFF, data >> 1 & 1))

@@ -43,8 +43,6 @@ def read_es(request: Request) -> Opened:
 def _parts(request: Request, is_atis: bool) -> Iterator[Part]:
     """Yield the events of a file after its header."""
     size = request.path.stat().st_size - HEADER_BYTES
-    if not size:
-        return
     raw, forget = mapped(request, HEADER_BYTES, np.dtype("u1"), size)
     state = np.zeros(3, np.int64)
     while True:

@@ -108,7 +108,7 @@ def recognised(path: Path) -> str:
     if fits:
         return max(fits)[1]
     for name, row in TABLE.items():
-        if path.suffix.lower() in row.suffixes and row.read:
+        if path.suffix.lower() in row.suffixes:
             return name
     raise ValueError(
         f"{path}: begins like no known event file ({head[:12]!r}); give format as one of {', '.join(FORMATS)}"

@@ -10,6 +10,7 @@ error, so that the rows before the first missing chunk can be read.
 
 import contextlib
 import io
+import math
 import mmap
 import struct
 from collections.abc import Iterator, Sequence
@@ -37,7 +38,7 @@ END_AT = {0: 40, 1: 44, 2: 28, 3: 28}  # byte of the declared length, by the ver
 SIZE_AT = {0: 13, 1: 13, 2: 9, 3: 9}  # byte of the number of bytes of an address, which is 8
 HEAD_BYTES, ADDRESS_BYTES = 64, 8
 CUT_ERRORS = (OSError, RuntimeError)  # errors of reading a missing part
-MAX_NODES, MAX_DEPTH = 10_000, 5  # limits of a listing
+MAX_NODES, MAX_DEPTH, MAX_LISTED = 10_000, 5, 12  # limits of a listing
 
 
 @contextlib.contextmanager
@@ -100,10 +101,10 @@ def attribute(file: h5py.File, name: str) -> Any:
     return value.decode() if isinstance(value, bytes) else value
 
 
-def numbers(file: h5py.File, name: str, most: int) -> list[int] | None:
-    """Return an attribute that is a list of at most `most` integers; None if it is something else."""
+def two_numbers(file: h5py.File, name: str) -> list[int] | None:
+    """Return an attribute that is a list of two integers; None if it is something else."""
     stored = file.attrs.get_id(name)
-    if len(stored.shape) != 1 or stored.shape[0] > most or not isinstance(stored.get_type(), SIMPLE[:1]):
+    if stored.shape != (2,) or not isinstance(stored.get_type(), SIMPLE[:1]):
         return None
     return [int(value) for value in file.attrs[name]]
 
@@ -129,19 +130,19 @@ def data_sets(file: h5py.File) -> dict[str, h5py.Dataset]:
     return found
 
 
-def listing(file: h5py.File, most: int = 12) -> str:
+def listing(file: h5py.File) -> str:
     """Describe the contents of a file in words."""
     found = data_sets(file)
-    shown = [f"{name} {data.dtype} {data.shape}" for name, data in list(found.items())[:most]]
-    more = f" and {len(found) - most} more" if len(found) > most else ""
+    shown = [f"{name} {data.dtype} {data.shape}" for name, data in list(found.items())[:MAX_LISTED]]
+    more = f" and {len(found) - MAX_LISTED} more" if len(found) > MAX_LISTED else ""
     return f"it contains {', '.join(shown) or 'no data sets'}{more}"
 
 
-def declared_length(file: h5py.File, name: str, most: int) -> int:
+def declared_length(file: h5py.File, name: str, most: int | None = None) -> int:
     """Return the length of a one-dimensional data set, after checking it without reading the data."""
     check_plain(file, name, 1)
     length = len(file[name])
-    if length > most:
+    if most is not None and length > most:
         raise ValueError(f"{name} declares {length} entries; at most {most} are read")
     check_declared(Path(file.filename), name, length * file[name].dtype.itemsize)
     return length
@@ -190,13 +191,13 @@ def check_own(file: h5py.File, name: str) -> None:
 
 def check_chunks(data: h5py.Dataset, name: str) -> None:
     """Raise ValueError for huge chunks, and for filters that are unknown or declare the wrong sizes."""
-    if data.chunks and int(np.prod(data.chunks, dtype=object)) * data.dtype.itemsize > MAX_CHUNK_BYTES:
+    size = math.prod(data.chunks) * data.dtype.itemsize if data.chunks else 0
+    if size > MAX_CHUNK_BYTES:
         raise ValueError(f"{name} has chunks of more than {MAX_CHUNK_BYTES} bytes")
     pipeline, codes = data.id.get_create_plist(), filters(data)
     for number, code in enumerate(codes):
         if code not in FILTERS:
             raise ValueError(f"{name} is packed with the filter {code}; write it again with blosc or gzip")
-        size = int(np.prod(data.chunks, dtype=object)) * data.dtype.itemsize if data.chunks else 0
         if code in BLOSC and pipeline.get_filter(number)[2][2:4] != (data.dtype.itemsize, size):
             raise ValueError(f"{name} describes its packing wrongly")
     if FLETCHER32 in codes[:-1]:  # the decompressed data may be too short for it

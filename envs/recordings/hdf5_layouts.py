@@ -19,10 +19,10 @@ from envs.recordings.hdf5_checks import (
     declared_length,
     is_cut,
     listing,
-    numbers,
     opened,
     row_parts,
     time_offset,
+    two_numbers,
 )
 from envs.recordings.names import COLUMNS, column_of, microseconds, roles, usual_unit
 from envs.recordings.npz import FIRST_ROWS, table_order
@@ -94,7 +94,7 @@ def read_hdf5(request: Request) -> Opened:
         found, others = find(request, file)
         count = request.check_declared(len(file[found.paths[0]]))
         for path in dict.fromkeys(found.paths):
-            if found.fields[0] is None and declared_length(file, path, max(count, 1 << 62)) != count:
+            if found.fields[0] is None and declared_length(file, path) != count:
                 raise ValueError(f"{path} and {found.paths[0]} differ in length")
         request = _sized(request, file, found)
     if others:
@@ -119,9 +119,8 @@ def find(request: Request, file: h5py.File) -> tuple[Found, list[str]]:
         groups = sorted({path.rpartition("/")[0] for path in sets})
         found = [one for group in groups if (one := _by_roles(request, sets, group))]
     if not found:
-        for name in ("events/t", "events"):  # raises an error about expected data sets that are invalid
-            if name.split("/")[0] in file and not sets:
-                check_plain(file, name, 1)
+        if "events" in file and not sets:  # raises an error about the expected data set
+            check_plain(file, "events/t", 1)
         known = "; ".join(f"{row.users}: {row.group or '/'}" for row in LAYOUTS)
         raise request.refusal(
             f"has no events in a layout that is known ({known}); {listing(file)}: give group= with the path "
@@ -143,8 +142,7 @@ def _matched(
             return _table(layout.group, layout.columns)
         return None
     paths = tuple(_join(layout.group, name) for name in layout.columns)
-    is_there = all(_has(file, path) for path in paths) and len(set(paths)) == len(COLUMNS)
-    return Found(layout.group, paths) if is_there else None
+    return Found(layout.group, paths) if all(_has(file, path) for path in paths) else None
 
 
 def _has(file: h5py.File, path: str) -> bool:
@@ -241,7 +239,7 @@ def _parts(request: Request, found: Found, count: int) -> Iterator[Part]:
             check_plain(file, path, 2 if isinstance(found.fields[0], int) else 1)
         offset = time_offset(file) if found.group == "events" else 0
         has_labels = found.group == "events" and file.get(NOISE, getlink=True) is not None
-        if has_labels and declared_length(file, NOISE, max(count, 1 << 62)) != count:
+        if has_labels and declared_length(file, NOISE) != count:
             raise ValueError("it must have one is_noise of 0 or 1 for each event")
         for rows in row_parts(request, [file[path] for path in paths]):
             labels = np.asarray(file[NOISE][rows]) if has_labels else None
@@ -297,8 +295,8 @@ def _size_of(file: h5py.File, group: str) -> tuple[int | None, int | None]:
     geometry = str(attribute(file, "geometry")) if "geometry" in given else ""
     if found := re.fullmatch(r"(\d{1,5})x(\d{1,5})", geometry, re.ASCII):
         return int(found[1]), int(found[2])
-    shape = numbers(file, "sensor_resolution", 2) if "sensor_resolution" in given else None  # event_utils
-    if shape and len(shape) == 2:
+    shape = two_numbers(file, "sensor_resolution") if "sensor_resolution" in given else None  # event_utils
+    if shape:
         return shape[1], shape[0]
     for name, ndim in ((_join(group, "width"), 0), (_join(group, "calib/resolution"), 1)):
         size = _size_set(file, name, ndim)

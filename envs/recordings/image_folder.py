@@ -58,11 +58,8 @@ def find_images(folder: Path, fps: float | None, max_bytes: int) -> tuple[list[P
             file or outside the folder.
     """
     known = next((one for one in LISTS if (folder / one.name).exists()), None)
-    names, times = _read_list(folder / known.name, known) if known else ([], [])
-    if names:
-        paths = [_inside(folder, folder / (known.name if known else ""), name) for name in names]
-    else:
-        paths = _images(folder)
+    images, times = _read_list(folder / known.name, known) if known else ([], [])
+    paths = images or _images(folder)
     if fps is None and not times:
         listed = ", ".join(f"{one.name} ({one.users})" for one in LISTS)
         raise ValueError(
@@ -108,10 +105,10 @@ def check_fps(fps: float | None) -> None:
         raise ValueError(f"fps must lie in (0, 1e6], got {fps}")
 
 
-def _read_list(path: Path, known: List) -> tuple[list[str], list[int]]:
-    """Return names and times [us] of a list."""
+def _read_list(path: Path, known: List) -> tuple[list[Path], list[int]]:
+    """Return the images and the times [us] of a list; no images if it names none."""
     check_file(path, MAX_LIST_BYTES)
-    names, times = [], []
+    images, times = [], []
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
@@ -127,8 +124,8 @@ def _read_list(path: Path, known: List) -> tuple[list[str], list[int]]:
                 f"got {line[:80]!r}; repair it, or give fps"
             )
         times.append(time_us)
-        names += [] if name is None else [name]
-    return names, times
+        images += [] if name is None else [_inside(path, name)]
+    return images, times
 
 
 def _row(text: str, known: List) -> tuple[str | None, int | None]:
@@ -146,13 +143,13 @@ def _row(text: str, known: List) -> tuple[str | None, int | None]:
     return facts.get("name"), round(time_us) if 0 <= time_us < 1_000_000 << 32 else None
 
 
-def _inside(folder: Path, listed: Path, name: str) -> Path:
-    """Return the path of an image of a list.
+def _inside(listed: Path, name: str) -> Path:
+    """Return the path of an image of a list, whose names are relative to the folder of the list.
 
     Raises:
         ValueError: The path is outside the folder; a list may come from an untrusted source.
     """
-    path = Path(name)
+    path, folder = Path(name), listed.parent
     if path.is_absolute() and path.parent.name == folder.resolve().name:
         path = Path(path.name)  # as DVS-Voltmeter writes them; the folder may have moved
     if path.is_absolute() or ".." in path.parts:

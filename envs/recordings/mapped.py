@@ -34,8 +34,6 @@ def mapped(
 
 def mapped_parts(request: Request, start: int, dtype: np.dtype, count: int) -> Iterator[np.ndarray]:
     """Yield the entries of a file in parts of about `part_events` entries."""
-    if not count:
-        return
     values, forget = mapped(request, start, dtype, count)
     for first in range(0, count, request.part_events):
         stop = min(count, first + request.part_events)

@@ -309,10 +309,11 @@ def _side_by_side(
 def _next(request: Request, file: IO[bytes], array: Array, size: int) -> np.ndarray:
     """Read the next rows of an array; fewer if the file ends."""
     row = int(np.prod(array.shape[1:], dtype=np.int64))
-    if array.dtype.hasobject or array.dtype.itemsize > 64 * 8 or row > 64:
+    row_bytes = row * array.dtype.itemsize
+    if array.dtype.hasobject or array.dtype.itemsize > 64 * 8 or row > 64 or row_bytes == 0:
         raise _no_numbers(request, array)
-    raw = file.read(size * row * array.dtype.itemsize)
-    got = len(raw) // (row * array.dtype.itemsize)
+    raw = file.read(size * row_bytes)
+    got = len(raw) // row_bytes
     values = np.frombuffer(raw, array.dtype, got * row)
     return values.reshape(got, *array.shape[1:])
 

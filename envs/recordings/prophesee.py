@@ -95,8 +95,7 @@ def read_evt(request: Request, format: str | None = None) -> Opened:
     word = WORDS[encoding]
     count = whole_entries(request, start, word.itemsize)
     words, forget = mapped(request, start, word, count)
-    parts = evt_parts(request, encoding, words, endianness, forget)
-    return Opened(encoding, request, parts)
+    return Opened(encoding, request, evt_parts(request, encoding, words, endianness, forget))
 
 
 def evt_parts(

@@ -1,7 +1,6 @@
 """Read events of any format: a whole file, a range of times, or part by part."""
 
 import copy
-import itertools
 import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -234,8 +233,7 @@ def tell(path: Path, file: EventFile) -> None:
         lines.append(f"left out or moved: {'; '.join(lost)}. strict=True refuses such a file")
     if file.gaps:
         shown = ", ".join(
-            f"{(b - a) / 1e6:,.1f} s from {a / 1e6:,.3f} s on"
-            for a, b in itertools.islice(file.gaps, MOST_GAPS)
+            f"{(b - a) / 1e6:,.1f} s from {a / 1e6:,.3f} s on" for a, b in file.gaps[:MOST_GAPS]
         )
         more = f" and {len(file.gaps) - MOST_GAPS:,} more" if len(file.gaps) > MOST_GAPS else ""
         lines.append(f"no events for {shown}{more}")

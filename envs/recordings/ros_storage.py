@@ -164,7 +164,7 @@ def _walk(path: Path) -> Iterator[Topic | Message]:
             yield from _walk_bag(file, size, {})
         elif magic.startswith(MAGIC_MCAP):
             file.seek(len(MAGIC_MCAP))
-            yield from _walk_mcap(file, size, {}, {0: ""})
+            yield from _walk_mcap(file, size, {}, {})
         else:
             yield from _walk_db3(path)
 

@@ -67,14 +67,13 @@ def event_writer(
     """
     path = Path(path)
     kind = format or WRITTEN_SUFFIXES.get(path.suffix.lower(), "")
-    if kind not in WRITERS:
+    if kind not in TABLE or (create := TABLE[kind].write) is None:
         raise ValueError(f"{path}: format must be one of {', '.join(WRITERS)}, got {format or path.suffix!r}")
-    row, labels = TABLE[kind], (is_labelled,) if kind in LABELLED else ()
-    if is_labelled and not row.has_labels:
+    labels = (is_labelled,) if kind in LABELLED else ()
+    if is_labelled and kind not in LABELLED:
         raise ValueError(f"{path}: {kind} stores no labels of noise; choose {' or '.join(LABELLED)}")
     check_events(np.empty(0, EVENT), width, height)
-    assert row.write is not None  # noqa: S101  for the type checker
-    with row.write(path, width, height, *labels) as append:
+    with create(path, width, height, *labels) as append:
         yield _checked(path, width, height, append, is_labelled)
 
 

@@ -280,20 +280,16 @@ def draw_obstacles(layout: Layout, rng: np.random.Generator) -> np.ndarray:
     count = int(layout.num_obstacles)
     shape = SHAPES[layout.shape]
     half = 0.5 * layout.width_m - layout.radius_max_m - shape.bar_m
+    rule = f"layout num_obstacles={count} cannot be placed {layout.min_gap_m} m apart"
+    remedy = "lower num_obstacles or min_gap_m, or widen the lane"
     if _share_covered(layout, half) > MAX_COVERED:  # checked first, because the tries would take minutes
-        raise ValueError(
-            f"layout num_obstacles={count} cannot be placed {layout.min_gap_m} m apart; "
-            "lower num_obstacles or min_gap_m, or widen the lane"
-        )
+        raise ValueError(f"{rule}; {remedy}")
     tries = rng.uniform((-half, layout.first_y_m), (half, layout.last_y_m), (TRIES_PER_OBSTACLE * count, 2))
     from envs.scene.collision import keep_apart  # loads numba, which a check of names does not need
 
     kept = keep_apart(tries, layout.min_gap_m, count)
     if len(kept) < count:
-        raise ValueError(
-            f"layout num_obstacles={count} cannot be placed {layout.min_gap_m} m apart ({len(kept)} fit); "
-            "lower num_obstacles or min_gap_m, or widen the lane"
-        )
+        raise ValueError(f"{rule} ({len(kept)} fit); {remedy}")
     bodies = np.zeros(count, OBSTACLE)
     bodies["kind"] = shape.kind
     bodies["x"], bodies["y"] = kept.T

@@ -56,11 +56,6 @@ class MovingBody:
             t_s = np.where(t_s > last, first + (t_s - first) % (last - first), t_s)
         return np.stack([np.interp(t_s, self.t_s, axis) for axis in self.places_m.T], axis=-1)
 
-    def place(self, t_s: float) -> np.ndarray:
-        """Return the body's centre at a time [s]: x, y, z [m], float64 (3,)."""
-        place: np.ndarray = self.places(np.array([t_s]))[0]
-        return place
-
 
 class Throw(NamedTuple):
     """A ball that is thrown at the vehicle.

@@ -111,8 +111,13 @@ def lattice_prices(
     y_m = np.arange(math.ceil(scene.length_m / LATTICE_M) + 1) * LATTICE_M
     clearance = np.broadcast_to(half - np.abs(x_m), (len(y_m), len(x_m))).copy()
     _approach(clearance, scene.sections(height_m), x_m, y_m, radius_m, FELT_M)
+    return _price(clearance), float(x_m[0])
+
+
+def _price(clearance: np.ndarray) -> np.ndarray:
+    """Return the price of places with a clearance [m], of the same shape."""
     price = np.exp(-np.maximum(clearance, 0.0) / CLEARANCE_SCALE_M)
-    return np.where(clearance <= 0.5 * LATTICE_M, BLOCKED, price), float(x_m[0])
+    return np.where(clearance <= 0.5 * LATTICE_M, BLOCKED, price)
 
 
 def prices_among(
@@ -147,10 +152,7 @@ def prices_among(
         x, y, _, _, hx, hy, r = body_sections(bodies[there], height_m).T[:, :, None]
         across = np.maximum(np.abs(y_m[rows][there][:, None] - y) - hy, 0.0)
         clearance = np.hypot(np.maximum(np.abs(first_x_m + x_m - x) - hx, 0.0), across) - r - radius_m
-        price = np.where(
-            clearance <= 0.5 * LATTICE_M, BLOCKED, np.exp(-np.maximum(clearance, 0.0) / CLEARANCE_SCALE_M)
-        )
-        prices[rows][there] = np.maximum(prices[rows][there], price)
+        prices[rows][there] = np.maximum(prices[rows][there], _price(clearance))
     return prices
 
 

@@ -96,18 +96,18 @@ def noise_waves(seed: int) -> tuple[np.ndarray, np.ndarray]:
     cycles = np.array([k for k in half if TILE_PERIODS / 2 <= math.hypot(*k) <= TILE_PERIODS])
     phases = np.random.default_rng(seed).uniform(0.0, 2.0 * math.pi, len(cycles))
     amplitudes = np.exp(1j * phases)
-    amplitudes /= np.abs(_sum_waves(cycles, amplitudes, TILE)).max()
+    amplitudes /= np.abs(_sum_waves(cycles, amplitudes)).max()
     return cycles, amplitudes
 
 
-def _sum_waves(cycles: np.ndarray, amplitudes: np.ndarray, size: int) -> np.ndarray:
-    """Return the sum of the waves at the texels, (size, size) float64, q along rows and s along columns.
+def _sum_waves(cycles: np.ndarray, amplitudes: np.ndarray) -> np.ndarray:
+    """Return the sum of the waves at the texels, (TILE, TILE) float64, q along rows and s along columns.
 
     It adds wave by wave, because the rounding of BLAS depends on the number of threads and the processor.
     """
-    turns = 2j * math.pi / size * np.arange(size)
+    turns = 2j * math.pi / TILE * np.arange(TILE)
     along_s, along_q = np.exp(np.outer(cycles[:, 0], turns)), np.exp(np.outer(cycles[:, 1], turns))
-    total = np.zeros((size, size))
+    total = np.zeros((TILE, TILE))
     for s, q, amplitude in zip(along_s, along_q, amplitudes, strict=True):
         wave = (q * amplitude)[:, None]
         total += wave.real * s.real - wave.imag * s.imag
@@ -117,6 +117,6 @@ def _sum_waves(cycles: np.ndarray, amplitudes: np.ndarray, size: int) -> np.ndar
 @functools.cache
 def noise_tile(seed: int) -> np.ndarray:
     """Return a tile of the noise, (TILE, TILE) float32, read-only: tile[j, i] is P at s = i, q = j texels."""
-    tile = _sum_waves(*noise_waves(seed), TILE).astype(np.float32)
+    tile = _sum_waves(*noise_waves(seed)).astype(np.float32)
     tile.flags.writeable = False
     return tile

@@ -13,7 +13,7 @@ from envs.events.flicker import NO_FLICKER, brightness_at, draw_flicker, looks_n
 from envs.events.lowpass import UNLIMITED
 from envs.events.ramps import ColumnCamera
 from envs.fidelity import RenderPlan, make_renderer, plan_renders, sub_renders
-from envs.kinematics import Outcome, Point
+from envs.kinematics import Point
 from envs.raycast.noise import NO_NOISE
 from envs.raycast.records import BODY, FRAME
 from envs.raycast.silhouettes import Way
@@ -82,7 +82,7 @@ class Sensor:
             state = self._camera.state, self._camera.pixels
             self._real = RealSensor(camera, self._config.faults, state, rng, t_us)
 
-    def step(self, start: Point, outcome: Outcome, end_us: int, way: np.ndarray | None = None) -> None:
+    def step(self, start: Point, end: Point, share: float, end_us: int, way: np.ndarray | None) -> None:
         """Simulate one control step from whole images: render along the way and set the events.
 
         The parts between renders last at least one microsecond. A vehicle stopped by contact or goal stands
@@ -91,7 +91,8 @@ class Sensor:
 
         Args:
             start: Position at the start of the step, x and y [m].
-            outcome: Result of the step.
+            end: Position at the end of the step, x and y [m].
+            share: Share of the step in which the vehicle moved.
             end_us: End of the control step [us].
             way: (N + 1, 2), the planned places at the ends of N parts of the step, of equal time [m]; None if
                 the way is straight.
@@ -103,22 +104,22 @@ class Sensor:
             self.t_us = end_us
             return
         start_us = self.t_us
-        moving_us = round(outcome.share * (end_us - start_us))
+        moving_us = round(share * (end_us - start_us))
         if self._pictures_alone:
             self.renders = int(moving_us > 0)
             if self.renders:
-                self.luminance = self._picture(outcome.end, start_us + moving_us)
+                self.luminance = self._picture(end, start_us + moving_us)
             self.t_us = end_us
             return
-        self._way = None if way is None else (way, outcome.share)
-        way_m = outcome.share * self._config.speed_mps / self._config.control_hz
+        self._way = None if way is None else (way, share)
+        way_m = share * self._config.speed_mps / self._config.control_hz
         if way is not None:
-            way_m = outcome.share * float(np.hypot(*np.diff(way, axis=0).T).sum())
+            way_m = share * float(np.hypot(*np.diff(way, axis=0).T).sum())
         renders = sub_renders(way_m, self.plan.max_step_m)
         if self._config.camera.memory == "reference":
             renders = max(renders, looks_needed(self._flicker, moving_us))
         self.renders = min(renders, moving_us)
-        events = self._render_along(start, outcome.end, moving_us)
+        events = self._render_along(start, end, moving_us)
         self.t_us = end_us
         self.events = self.with_faults(events, start_us, end_us)
         self.dropped += self.lost

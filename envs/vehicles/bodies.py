@@ -30,11 +30,10 @@ class Bodies:
 
     def start(self, row: int, config: EnvConfig, dynamics: Dynamics, place: Point) -> int:
         """Start an episode of one vehicle at `place`; return the parts of its steps, 0 if kinematic."""
-        if self.dynamics.pop(row, None) is not None:
-            self._state[row], self._kinds = 0.0, None
+        self.dynamics.pop(row, None)
+        self._state[row], self._kinds = 0.0, None
         if dynamics.move is None:
             return 0
-        self._kinds = None
         self.dynamics[row] = dynamics
         parts = self._parts[row] = parts_of_step(config)
         self._dt_s[row] = 1.0 / (config.control_hz * parts)

@@ -14,9 +14,10 @@ from numba.typed import List
 
 from envs.events import EVENT
 from envs.events.camera import MAX_EVENTS_PER_FRAME
+from envs.events.emission import concatenated
 from envs.events.faults import spoil
-from envs.fidelity import parts_of
-from envs.kinematics import Lane, advance_among, clock_us, follow, planned_position
+from envs.fidelity import sub_renders
+from envs.kinematics import Lane, advance, clock_us, follow, planned_position
 from envs.raycast.silhouettes import Way
 from envs.sensor import joined, sense_way
 
@@ -101,18 +102,8 @@ def step_all(rows, corridors, faulty, actions, ways, active):
                 found.append(events)
                 ends[row + 1] += events.size
             rows[row].over |= rows[row].problem != GOOD
-    together = _concatenated(found, ends[-1])
-    return together, ends, _concatenated(true, true_ends[-1]) if spoilt else together, true_ends
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _concatenated(parts, total):
-    """Concatenate EVENT arrays with `total` events in all."""
-    together, size = np.empty(total, EVENT), 0
-    for events in parts:
-        together[size : size + events.size] = events
-        size += events.size
-    return together
+    together = concatenated(found, ends[-1])
+    return together, ends, concatenated(true, true_ends[-1]) if spoilt else together, true_ends
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -129,7 +120,7 @@ def _move(vehicle, action, still_and_moving, way):
         step_m = vehicle.speed_mps, vehicle.control_hz
         x_m, y_m = planned_position(vehicle.spawn_x_m, moves, step_m)
         planned = x_m, vehicle.spawn_y_m + y_m
-        outcome = advance_among(lane, still_and_moving, (0.0, 1.0), start, planned)
+        outcome = advance(lane, still_and_moving, (0.0, 1.0), start, planned)
     else:
         outcome = follow(lane, still_and_moving, way[: vehicle.parts + 1])
     vehicle.start_x_m, vehicle.start_y_m = start
@@ -184,7 +175,7 @@ def _look_along(vehicle, view, places, part):
         way_m = math.hypot(way.end_x - way.start_x, way.end_y - way.start_y)
     if way.moving_us == 0:
         return np.empty(0, EVENT)
-    parts = min(parts_of(way_m, vehicle.max_step_m), way.moving_us)
+    parts = min(sub_renders(way_m, vehicle.max_step_m), way.moving_us)
     vehicle.problem, dropped, columns, events = sense_way(view, way, parts)
     vehicle.dropped += dropped
     vehicle.renders += columns / view.seen_us.size

@@ -9,7 +9,7 @@ from core.neighbour_filter import NEVER, filter_all
 from envs.config import EnvConfig
 from envs.events import EVENT
 from envs.events.faults import FaultState
-from envs.kinematics import Outcome, Point, clock_us
+from envs.kinematics import Point, clock_us
 from envs.scene import Scene
 from envs.scene.moving import MovingBody, Throws
 from envs.scene.paths import moving_sections
@@ -192,24 +192,22 @@ class Vehicles:
 
     def events_of(self, row: int) -> np.ndarray:
         """Return the EVENT array of a vehicle in the last step; empty if the vehicle was not active."""
-        if not self.rows["t_us"][row]:
-            return np.empty(0, EVENT)
-        return self.events[self.ends[row] : self.ends[row + 1]]
+        return self._part_of(row, self.events, self.ends)
 
     def seen_of(self, row: int) -> np.ndarray:
         """Return the events of a vehicle that pass its neighbour filter."""
-        if not self.rows["t_us"][row]:
-            return np.empty(0, EVENT)
-        return self.seen[self.seen_ends[row] : self.seen_ends[row + 1]]
+        return self._part_of(row, self.seen, self.seen_ends)
 
     def true_of(self, row: int) -> np.ndarray:
         """Return the events of a vehicle before the faults of its sensor."""
         sensor = self._sensors[row]
-        if not self.rows["t_us"][row]:
-            return np.empty(0, EVENT)
-        if row in self._in_python and sensor is not None:
+        if row in self._in_python and sensor is not None and self.rows["t_us"][row]:
             return sensor.true_events
-        return self._true[self._true_ends[row] : self._true_ends[row + 1]]
+        return self._part_of(row, self._true, self._true_ends)
+
+    def _part_of(self, row: int, events: np.ndarray, ends: np.ndarray) -> np.ndarray:
+        """Return the part of a vehicle in the events of the last step; empty before its first step."""
+        return events[ends[row] : ends[row + 1]] if self.rows["t_us"][row] else np.empty(0, EVENT)
 
     def decided(self, row: int) -> np.ndarray:
         """Return the actions that a vehicle has decided and not yet taken, the next one first."""
@@ -254,21 +252,16 @@ class Vehicles:
     def _move_bodies(self, active: np.ndarray) -> None:
         """Move the bodies of the active vehicles' scenes through the next control step."""
         for row, moving in self._moving.items():
-            if active[row]:
-                self._move_bodies_of(row, moving)
-
-    def _move_bodies_of(self, row: int, moving: Moving) -> None:
-        vehicle, sensor = self.rows[row], self._sensors[row]
-        start_us = int(vehicle["t_us"])
-        end_us = clock_us(int(vehicle["steps"]) + 1, float(vehicle["control_hz"]))
-        ahead = (
-            "vy_mps" if vehicle["parts"] else "speed_mps"
-        )  # balls are aimed at a kinematic vehicle as if it flew straight ahead
-        state = tuple(float(vehicle[name]) for name in ("x_m", "y_m", "vx_mps", ahead))
-        moving.throw(1e-6 * start_us, state)
-        span_s = 1e-6 * start_us, 1e-6 * end_us
-        moving_sections(moving.bodies, *span_s, float(vehicle["height_m"]), moving.sections)
-        if sensor is not None:
+            vehicle, sensor = self.rows[row], self._sensors[row]
+            if not active[row] or sensor is None:
+                continue
+            end_us = clock_us(int(vehicle["steps"]) + 1, float(vehicle["control_hz"]))
+            span_s = 1e-6 * int(vehicle["t_us"]), 1e-6 * end_us
+            # Balls are aimed at a kinematic vehicle as if it flew straight ahead.
+            ahead = "vy_mps" if vehicle["parts"] else "speed_mps"
+            state = tuple(float(vehicle[name]) for name in ("x_m", "y_m", "vx_mps", ahead))
+            moving.throw(span_s[0], state)
+            moving_sections(moving.bodies, *span_s, float(vehicle["height_m"]), moving.sections)
             sensor.move_bodies(moving.bodies, *span_s)
 
     def _set_task(self, row: int, name: str) -> None:
@@ -316,11 +309,10 @@ class Vehicles:
                 events = sensor.with_faults(events, start_us, t_us)
                 vehicle["dropped"] += sensor.lost
                 return events
-            end = float(vehicle["x_m"]), float(vehicle["y_m"])
-            share, ends = float(vehicle["share"]), (bool(vehicle["success"]), bool(vehicle["collision"]))
-            outcome = Outcome(end, share, float(vehicle["reward"]), *ends)
             start = float(vehicle["start_x_m"]), float(vehicle["start_y_m"])
-            sensor.step(start, outcome, t_us, self._bodies.way(row) if vehicle["parts"] else None)
+            end = float(vehicle["x_m"]), float(vehicle["y_m"])
+            way = self._bodies.way(row) if vehicle["parts"] else None
+            sensor.step(start, end, float(vehicle["share"]), t_us, way)
         except ValueError as error:
             vehicle["over"] = True
             raise StepError(row, str(error)) from error

@@ -7,19 +7,16 @@ from envs.observations import OFF_RGB, ON_RGB
 INK, MUTED, GRID = "#1f2430", "#6b7280", "#e5e7eb"
 BLACK, SLATE = "#111827", "#64748b"
 BLUE, CYAN, GREEN, LIME = "#2563eb", "#0891b2", "#059669", "#65a30d"
-AMBER, BROWN, RED, PINK, PURPLE, VIOLET = "#d97706", "#b45309", "#dc2626", "#db2777", "#7c3aed", "#9333ea"
+AMBER, BROWN, RED, PINK, VIOLET = "#d97706", "#b45309", "#dc2626", "#db2777", "#9333ea"
 GREYS = ("#9ca3af", "#6b7280", "#374151", "#111827")  # for comparisons, from light to dark
 EVENTS = np.array([OFF_RGB, (21, 24, 31), ON_RGB])  # OFF, no event, ON
 # Colours by what is drawn.
 COLOURS = {
     # outcomes of episodes
     "goal": BLUE, "collision": RED, "time limit": BROWN,
-    # settings of the simulator
-    "default": BLACK, "most exact": BLACK, "together": SLATE, "tolerance": BLUE, "renders": GREEN,
-    "anti-aliasing": AMBER, "pyrender": PURPLE, "encoding": PINK, "culling": CYAN, "memory": RED,
     # settings of the encoder
     "precision": LIME, "time bins": VIOLET, "newest events": BROWN, "torch": RED, "chunks": GREEN,
-    "context": CYAN,
+    "context": CYAN, "default": BLACK,
     # codings of time, targets of the decoder, memory modes
     "additive": BLUE, "eventnet": AMBER, "none": MUTED,
     "occupancy": BLUE, "signed": AMBER, "aged": GREEN, "counts": PINK, "proximity": SLATE,

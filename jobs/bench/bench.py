@@ -110,7 +110,7 @@ def show(scores: Scores, protocol: Protocol) -> None:
         for name, rates in scores.failures.items()
     ]
     head = ("Corruption", *(f"{severity} [%]" for severity in range(1, 6)), "CE [%]")
-    show_table(f"Failures of {protocol.corridors} episodes, and corruption error", head, rows, 1, None)
+    show_table(f"Failures of {protocol.corridors} episodes, and corruption error", head, rows)
     low, high = scores.interval or (np.nan, np.nan)
     console.print(
         f"mCE {100 * scores.mce:.1f} % [{100 * low:.1f}, {100 * high:.1f}], 100 % is the reference "

@@ -77,14 +77,10 @@ def run(config: Config, executor: Executor | None = None) -> dict[str, float]:
         executor = executor or default_executor(config.cluster, Path(folder))
         repeated = evaluate_cells(tasks, EpisodeStore(Path(folder)), executor, "Verify")
     check_equal(submission, repeated, protocol)
-    said = f"{len(chosen)} of {total(submission)} episodes repeated (drawn by {draw}), all equal to the byte"
+    total = sum(rows.size for rows in submission.episodes.values())
+    said = f"{len(chosen)} of {total} episodes repeated (drawn by {draw}), all equal to the byte"
     console.print(f"{result.name}: {said}", markup=False)
     return {"repeated": float(len(chosen))}
-
-
-def total(submission: Submission) -> int:
-    """Return the number of episodes of a result."""
-    return sum(rows.size for rows in submission.episodes.values())
 
 
 def choose(submission: Submission, share: float, rng: np.random.Generator) -> Chosen:

@@ -5,13 +5,13 @@ import sys
 import time
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from envs.config import EnvConfig
 from jobs.bench.protocol import Cell
-from jobs.bench.result import Cost
+from jobs.bench.result import Cost, Kind
 from jobs.config.config import Config
 from jobs.rollout.agents import BASELINES, ONNX, Agent, make_agent
 from jobs.rollout.episodes import roll_out
@@ -25,7 +25,6 @@ from jobs.run.folder import locate_run
 from jobs.run.torch_threads import torch_threads
 
 Tasks = Mapping[Cell, list[EvaluationTask]]
-Kind = Literal["folder", "onnx", "function", "baseline"]
 
 
 def find_benchmarked(key: str, name: str, config: Config) -> tuple[EvaluatedPolicy, Kind]:

@@ -63,9 +63,9 @@ class Protocol:
         return found
 
 
-def read_protocol(path: Path = PROTOCOL) -> Protocol:
-    """Read a protocol from its YAML file."""
-    text = path.read_bytes()
+def read_protocol() -> Protocol:
+    """Read the protocol from its YAML file."""
+    text = PROTOCOL.read_bytes()
     values = yaml.safe_load(text)
     env = env_with(EnvConfig(split=values["split"]), values.pop("env"))
     return Protocol(sha256=hashlib.sha256(text).hexdigest(), env=env, **values)

@@ -28,6 +28,7 @@ LABELS = ("Corruption", "Severity")
 Digest = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 Rate = Annotated[float, Field(ge=0.0, le=1.0)]
 Text = Annotated[str, Field(min_length=1, max_length=200)]
+Kind = Literal["folder", "onnx", "function", "baseline"]
 
 
 class Cost(pydantic.BaseModel, extra="forbid", strict=True):
@@ -60,7 +61,7 @@ class Result(pydantic.BaseModel, extra="forbid", strict=True):
     part: Text
     policy: Text
     training: Annotated[int, Field(ge=0)] | None
-    kind: Literal["folder", "onnx", "function", "baseline"]
+    kind: Kind
     identity: Text
     source: str
     action: Literal["deterministic", "stochastic"]

@@ -14,7 +14,6 @@ TAKE_A_WORD = (  # options of Hydra whose value is the next word
     *("--cfg", "-c", "--package", "-p", "--info", "-i"),
     *("--config-path", "-cp", "--config-name", "-cn", "--config-dir", "-cd"),
 )
-EXPERIMENT = re.compile(r"\+exp=(\w+)")
 
 
 def hydra_words(words: Sequence[str]) -> list[str]:
@@ -71,10 +70,8 @@ def given_keys(words: Sequence[str]) -> set[str]:
 
 def _experiment(file: Path) -> set[str]:
     """Return {"exp"} for the experiment of a policy; stages and studies use the experiment of the run."""
-    policy = (
-        file.is_file() and f"\nexp: {file.stem}\n" in file.read_text() and "/job:" not in file.read_text()
-    )
-    return {"exp"} if policy else set()
+    text = file.read_text() if file.is_file() else ""
+    return {"exp"} if f"\nexp: {file.stem}\n" in text and "/job:" not in text else set()
 
 
 def _leaves(file: Path) -> set[str]:
@@ -109,7 +106,7 @@ def experiments() -> list[str]:
 
 def _job(word: str) -> str:
     """Return `job=NAME` with the job's current name if the word names a job; otherwise return the word."""
-    named = EXPERIMENT.fullmatch(word) or re.fullmatch(r"job=(\w+)", word)
+    named = re.fullmatch(r"(?:\+exp|job)=(\w+)", word)
     if not named:
         return word
     name = RENAMED_JOBS.get(named[1], named[1])

@@ -190,13 +190,10 @@ def _axis_errors(axis: Mapping[str, Sequence[Setting]], env: EnvConfig) -> list[
 
 def _key_errors(settings: Mapping[str, object]) -> list[str]:
     """Return one line for each key that is no setting of the simulation."""
-    unknown = {
-        key: value
+    return [
+        f"{key}: no such setting, got {value}{nearest(key, CONDITION_KEYS)}"
         for key, value in settings.items()
         if key not in CONDITION_KEYS and not key.startswith(OPEN_KEYS)
-    }
-    return [
-        f"{key}: no such setting, got {value}{nearest(key, CONDITION_KEYS)}" for key, value in unknown.items()
     ]
 
 

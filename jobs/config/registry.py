@@ -24,7 +24,7 @@ class Job(NamedTuple):
     """
 
     module: str
-    file: Path | None = None
+    file: Path
 
     @property
     def summary(self) -> str:
@@ -34,15 +34,15 @@ class Job(NamedTuple):
             return text.readline().strip().strip('"').rstrip(".")
 
     def values(self) -> dict[str, Any]:
-        """Return the content of its file; empty without a file."""
+        """Return the content of its file."""
         import yaml  # imported late: the launcher reports missing packages
 
-        return dict(yaml.safe_load(self.file.read_text(encoding="utf-8"))) if self.file else {}
+        return dict(yaml.safe_load(self.file.read_text(encoding="utf-8")))
 
     def own_keys(self) -> list[str]:
         """Return the names of the job's own settings."""
         values = self.values()
-        return list(values.get(values["job"], ())) if values else []
+        return list(values.get(values["job"], ()))
 
     def settings(self) -> type[Any] | None:
         """Import the module and return the class of the job's own settings; None if it has none."""

@@ -20,7 +20,7 @@ def scene_errors(named: Sequence[tuple[str, str]], env: EnvConfig) -> list[str]:
     """
     vehicle = env.vehicle_radius_m, env.camera_height_m
     default = vehicle == (EnvConfig.vehicle_radius_m, EnvConfig.camera_height_m) and not env.layout
-    errors: dict[str, str] = {}
+    errors = []
     for key, scene in named:
         if default and scene in LAYOUTS:
             continue
@@ -31,6 +31,5 @@ def scene_errors(named: Sequence[tuple[str, str]], env: EnvConfig) -> list[str]:
         except ValueError as error:
             text = str(error)
             key = "env.layout" if text.startswith("layout") else key
-            line = f"{key}: {text.removeprefix('layout: ').removeprefix('scene ')}"
-            errors.setdefault(f"{key} {scene}", line)
-    return list(dict.fromkeys(errors.values()))
+            errors.append(f"{key}: {text.removeprefix('layout: ').removeprefix('scene ')}")
+    return list(dict.fromkeys(errors))

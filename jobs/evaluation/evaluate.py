@@ -63,29 +63,25 @@ def run(config: Config) -> dict[str, float]:
     """Evaluate the run's policy, or the newest one; return the metrics of the tracker."""
     find_policy(config, locate_run(config))
     folder = open_run(config)
-    config = folder.config
-    with open_tracker(config, folder) as tracker:
-        found = evaluate(config, folder, tracker)
+    with open_tracker(folder.config, folder) as tracker:
+        found = evaluate(folder, tracker)
         console.print(tracker.dashboard())
     return found
 
 
-def evaluate(
-    config: Config, folder: Run, tracker: Tracker, executor: Executor | None = None
-) -> dict[str, float]:
+def evaluate(folder: Run, tracker: Tracker) -> dict[str, float]:
     """Evaluate every task, write tables, plots and a video, and return the metrics.
 
     If the same policy was evaluated with the same settings, return those metrics, unless tasks failed then.
 
     Args:
-        config: The experiment.
-        folder: Its run folder.
+        folder: The run folder.
         tracker: Its MLflow run.
-        executor: Runs the missing episodes; None: on all cores.
 
     Raises:
         RuntimeError: A task of the first renderer failed.
     """
+    config = folder.config
     policy = find_policy(config, folder)
     manifest = load_policy(policy.agent).manifest
     check_sensor(manifest["sensor"], config.env)
@@ -94,10 +90,10 @@ def evaluate(
     if done is not None and done["asked"] == asked and not done.get("missing"):
         console.print((folder.evaluation / "table.md").read_text(), markup=False)
         return done["figures"]
-    announce(config, folder, policy)
+    announce(folder, policy)
     tracker.tags({"policy": manifest["name"]})
     tasks = plan_evaluation(config, policy)
-    executor = executor or default_executor(config.cluster, folder.evaluation)
+    executor = default_executor(config.cluster, folder.evaluation)
     results = evaluate_all(tasks, EpisodeStore(folder.evaluation), executor)
     episodes = {label: result.episodes for label, result in results.items()}
     summaries = [summarise(label, rows) for label, rows in episodes.items()]
@@ -200,9 +196,9 @@ def trajectories(tasks: Sequence[EvaluationTask]) -> list[Trajectory]:
     return found
 
 
-def announce(config: Config, folder: Run, policy: EvaluatedPolicy) -> None:
+def announce(folder: Run, policy: EvaluatedPolicy) -> None:
     """Print which policy is evaluated."""
-    newest = f"the newest of {folder.config.model.name} in {config.runs_dir}"
+    newest = f"the newest of {folder.config.model.name} in {folder.config.runs_dir}"
     which = "this run's own" if Path(policy.agent) == folder.policy else newest
     console.print(f"Policy: {policy.agent}, {which}", markup=False)
 

@@ -354,7 +354,6 @@ def met_fidelity(policies: Sequence[EvaluatedPolicy]) -> dict[str, list[str]]:
 def write_trade(folder: Run, tracker: Tracker, rows: Sequence[TradedSetting], facts: TradeFacts) -> None:
     """Print the tables; write tables, plot and page into run folder and tracker, and child runs."""
     place, groups = folder.path / "trade", list(facts["policies"])
-    (place / "images").mkdir(parents=True, exist_ok=True)
     lines = [(row.scene, *line) for row, line in zip(rows, trade_lines(rows, groups), strict=True)]
     title = "What each setting costs and gives"
     publish_table(folder, tracker, "trade/table", title, ("Scene", *headings(groups)), lines)

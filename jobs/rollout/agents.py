@@ -278,7 +278,7 @@ def follow(path_x_m: np.ndarray, moves_m: np.ndarray, x_m: float, y_m: float) ->
     return int(np.abs(x_m + moves_m[:, 0] - places).argmin())
 
 
-def plan_path(scene: Scene, start_x_m: float, radius_m: float, height_m: float = 2.0) -> np.ndarray:
+def plan_path(scene: Scene, start_x_m: float, radius_m: float, height_m: float) -> np.ndarray:
     """Return the cheapest path to the goal line on a lattice of the three directions (`envs.scene.planning`).
 
     Args:

@@ -54,15 +54,12 @@ class DriftSampler:
 
     It starts with every step. Whenever it has more than `MAX_WINDOWS`, it drops every other sampled step, so
     that it samples every second, fourth, ... step, the same steps in all episodes.
-
-    Attributes:
-        samples: Whether it samples at all; False for an agent without an encoder.
     """
 
     def __init__(self, agent: str | Path) -> None:
         """Sample for the policy in the folder `agent`; a baseline's name samples nothing."""
         self._file = Path(agent) / ENCODER
-        self.samples = self._file.is_file()
+        self._samples = self._file.is_file()  # False for an agent without an encoder
         self._every, self._steps = 1, Counter[int]()
         self._kept: list[tuple[int, np.ndarray]] = []
 
@@ -73,7 +70,7 @@ class DriftSampler:
 
     def add(self, env: CorridorEnv, seed: int, observation: np.ndarray) -> None:
         """Sample the window of this step if the step is due (a `jobs.rollout.episodes.Watch`)."""
-        if not self.samples:
+        if not self._samples:
             return
         step = self._steps[seed]
         self._steps[seed] += 1

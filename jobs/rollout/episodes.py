@@ -158,7 +158,7 @@ class Trajectory:
     scene: Scene
     xy_m: np.ndarray
     outcome: str
-    height_m: float = 2.0
+    height_m: float
 
 
 class TrajectoryRecorder:

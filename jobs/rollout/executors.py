@@ -115,7 +115,7 @@ def _evaluate(parts: Sequence[Part]) -> list[PartResult]:
     drifts = [DriftSampler(task.policy.agent) for task in tasks]
     agent = cached_agent(tasks[0].policy.agent, tasks[0].action, tasks[0].table)
     flights = [
-        Flight(task.env, seed, drift.add if drift.samples else None)
+        Flight(task.env, seed, drift.add)
         for task, drift in zip(tasks, drifts, strict=True)
         for seed in task.seeds
     ]

@@ -136,9 +136,7 @@ def find_policy(config: Config, run: Run) -> EvaluatedPolicy:
     return read_policy(str(newest[name]))
 
 
-def find_policies(
-    key: str, name: str, config: Config, run: Run, pretrained: Path = PRETRAINED
-) -> list[EvaluatedPolicy]:
+def find_policies(key: str, name: str, config: Config, run: Run) -> list[EvaluatedPolicy]:
     """Return the policies and baselines that a name stands for.
 
     The name of a group of published policies, such as bytestream, means all its trainings: bytestream-s0,
@@ -146,19 +144,18 @@ def find_policies(
 
     Args:
         key: Key of the name in the configuration, for messages.
-        name: "pretrained", "newest", a baseline, a folder, or a name in `pretrained`.
+        name: "pretrained", "newest", a baseline, a folder, or a name in models/pretrained.
         config: Configuration of the experiment.
         run: Its run folder.
-        pretrained: Folder of the published policies.
 
     Raises:
         ConfigError: If there is no such policy.
     """
-    published = sorted(path.parent for path in pretrained.glob(f"*/{MANIFEST}"))
+    published = sorted(path.parent for path in PRETRAINED.glob(f"*/{MANIFEST}"))
     if name == "pretrained":
         if not published:
             raise ConfigError(
-                f"{key}: 'pretrained' means the policies in {str(pretrained)!r}, which holds none; "
+                f"{key}: 'pretrained' means the policies in {str(PRETRAINED)!r}, which holds none; "
                 f"train one (python -m platform.launch +exp=bytestream) and name it: {key}=[newest]"
             )
         return [read_policy(str(path)) for path in published]
@@ -166,7 +163,7 @@ def find_policies(
         return [find_policy(config, run)]
     if name in BASELINES:
         return [read_policy(name)]
-    path = named_policy(name) or named_policy(str(pretrained / name))
+    path = named_policy(name) or named_policy(str(PRETRAINED / name))
     group = [path for path in published if re.fullmatch(re.escape(name) + r"-s\d+", path.name)]
     trainings = group if path is None else [path]
     if not trainings:
@@ -193,9 +190,7 @@ def find_one_policy(key: str, name: str, config: Config, run: Run) -> EvaluatedP
     return find_policies(key, name, config, run)[0]
 
 
-def find_study_policies(
-    config: Config, run: Run, pretrained: Path = PRETRAINED
-) -> tuple[EvaluatedPolicy, ...]:
+def find_study_policies(config: Config, run: Run) -> tuple[EvaluatedPolicy, ...]:
     """Return the policies that `study.policies` names, without duplicates, sorted by group and seed.
 
     Groups are in the order of the names.
@@ -206,7 +201,7 @@ def find_study_policies(
     named = [
         policy
         for name in config.own.policies
-        for policy in find_policies("study.policies", name, config, run, pretrained)
+        for policy in find_policies("study.policies", name, config, run)
     ]
     policies = list({policy.identity: policy for policy in named}.values())
     first: dict[str, EvaluatedPolicy] = {}
@@ -267,7 +262,7 @@ def with_own_parts(policy: EvaluatedPolicy, env: EnvConfig) -> EnvConfig:
 
 def own_sensor_differences(policy: EvaluatedPolicy, env: EnvConfig) -> Differences:
     """Return the sensor settings in which training and environment differ; none for a baseline."""
-    return sensor_differences(dict(policy.sensor), env) if policy.sensor else {}
+    return sensor_differences(policy.sensor, env) if policy.sensor else {}
 
 
 def check_sensor(sensor: Mapping[str, Any], env: EnvConfig) -> None:
@@ -276,7 +271,7 @@ def check_sensor(sensor: Mapping[str, Any], env: EnvConfig) -> None:
     Raises:
         ValueError: If a setting differs; the message names both values.
     """
-    differ = sensor_differences(dict(sensor), env)
+    differ = sensor_differences(sensor, env)
     if differ:
         got = "; ".join(f"{key} = {ours!r} instead of {theirs!r}" for key, (theirs, ours) in differ.items())
         raise ValueError(f"the sensor must be the policy's, got {got}; the study job evaluates such changes")

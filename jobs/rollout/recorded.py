@@ -62,7 +62,7 @@ class RecordedEpisode:
 def record_episode(agent: PolicyAgent, env: EnvConfig, seed: int) -> RecordedEpisode:
     """Roll out and record the episode of one seed; recording does not change the episode."""
     recorder = _Recorder(agent)
-    (episode,) = roll_out(recorder, env, [seed], num_envs=1)
+    (episode,) = roll_out(recorder, env, [seed])
     return RecordedEpisode(episode, recorder.moments, recorder.env.scene, recorder.env.config)
 
 

@@ -13,10 +13,6 @@ from jobs.rollout.tasks import MAX_EPISODES, EvaluationTask, split
 from jobs.run.progress import progress
 
 
-class NothingEvaluatedError(RuntimeError):
-    """All tasks failed; the message gives one reason in one line."""
-
-
 def evaluate_tasks(
     tasks: Sequence[EvaluationTask],
     store: EpisodeStore,
@@ -37,7 +33,7 @@ def evaluate_tasks(
         Key -> result for the tasks that succeeded, and key -> reason for those that failed.
 
     Raises:
-        NothingEvaluatedError: If all tasks failed.
+        RuntimeError: All tasks failed; the message gives one reason in one line.
     """
     unique: dict[str, EvaluationTask] = {}
     for task in tasks:
@@ -53,7 +49,7 @@ def evaluate_tasks(
         failed = {part.task.key: recorder.reason(part) for part in parts if store.missing(part.task).seeds}
     if unique and len(failed) == len(unique):
         reason = next(iter(failed.values()))
-        raise NothingEvaluatedError(f"nothing could be evaluated: {reason}; the same command tries again")
+        raise RuntimeError(f"nothing could be evaluated: {reason}; the same command tries again")
     return {key: store.result(task) for key, task in unique.items() if key not in failed}, failed
 
 

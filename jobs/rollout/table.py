@@ -49,16 +49,11 @@ def read_table(path: Path) -> pd.DataFrame:
         RunError: The file lacks a column that has no default.
     """
     table = pd.read_csv(path, dtype=WORDS, keep_default_na=False, na_values={"Training": [""]})
-    return table.assign(**_missing(path, list(table.columns)))
-
-
-def _missing(path: Path, columns: Sequence[str]) -> dict[str, object]:
-    """Return the defaults of the columns that a file lacks; raise `RunError` if one has no default."""
-    lacking = [name for name in COLUMNS if name not in columns]
+    lacking = [name for name in COLUMNS if name not in table.columns]
     without = [name for name in lacking if name not in ADDED]
     if without:
         raise RunError(f"{path}: must have the columns {without}; evaluate again")
-    return {name: ADDED[name] for name in lacking}
+    return table.assign(**{name: ADDED[name] for name in lacking})
 
 
 def episodes_of(rows: Sequence[Sequence[object]], columns: Sequence[str]) -> np.ndarray:

@@ -59,7 +59,8 @@ def main(which: str = "first") -> None:
         if _is_current(which):
             return
         now, start = _digest(), time.perf_counter()
-        archive = _archive(f"{now}-{which}")
+        cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        archive = Path(cache, "evade", "kernels", f"{now}-{which}.zip")  # all clones share it
         if unpack(archive):
             console.print("Took the kernels that another clone of the same sources compiled.")
         else:
@@ -86,12 +87,6 @@ def _digest() -> str:
     places = [os.environ.get(f"NUMBA_{name}") for name in ("CPU_NAME", "CPU_FEATURES", "CACHE_DIR")]
     whole.update(repr([compiler, places]).encode())
     return whole.hexdigest()
-
-
-def _archive(name: str) -> Path:
-    """Return the path of an archive of kernels in the user's cache, which all clones share."""
-    cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(cache, "evade", "kernels", f"{name}.zip")
 
 
 def pack(archive: Path) -> None:

@@ -9,11 +9,6 @@ import os
 LEARNER_DEVICE = "EVADE_LEARNER_DEVICE"
 
 
-def device_variables(device: str) -> dict[str, str]:
-    """Return the environment variables that name the device to the processes of a job."""
-    return {LEARNER_DEVICE: device}
-
-
 def learner_device() -> str:
     """Return the device of this process by its name in torch."""
     return os.environ.get(LEARNER_DEVICE, "cpu")

@@ -6,7 +6,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from types import FrameType
 
 from jobs.run.signals import ENDING, signal_of
@@ -24,20 +24,13 @@ class HeadLostError(RuntimeError):
 
 
 @contextlib.contextmanager
-def watching_head(
-    ask: Callable[[float], bool] | None = None, ended: Callable[[], str] | None = None
-) -> Iterator[None]:
+def watching_head() -> Iterator[None]:
     """Stop the block, which runs in the main thread, if Ray's head is silent for `SILENCE_S` or Ray ends.
-
-    Args:
-        ask: Return whether the head answers within the given seconds; None: ask the running Ray.
-        ended: Return which of the processes of Ray that this process started has ended, "" if none; None: ask
-            the running Ray.
 
     Raises:
         HeadLostError: The head was silent for `SILENCE_S`, or a process of Ray has ended.
     """
-    watch = _Watch(ask or head_answers, ended or ended_process)
+    watch = _Watch()
     threading.Thread(target=watch.run, name="head-watch", daemon=True).start()
     try:
         with _heard(watch.lost):
@@ -96,15 +89,15 @@ CONTINUES = "the same command continues"
 
 
 class _Watch:
-    def __init__(self, ask: Callable[[float], bool], ended: Callable[[], str]) -> None:
-        self.ask, self.ended, self.reason = ask, ended, ""
+    def __init__(self) -> None:
+        self.reason = ""
         self.over, self.lost, self.told = threading.Event(), threading.Event(), threading.Event()
 
     def run(self) -> None:
         asked_s = time.monotonic()
         while not self.over.wait(LOOK_EVERY_S):
             due = time.monotonic() - asked_s > ASK_EVERY_S
-            self.reason = self._lost() if due or self.ended() else ""
+            self.reason = self._lost() if due or ended_process() else ""
             if self.reason and not self.over.is_set():
                 self._stop()
                 return
@@ -117,10 +110,10 @@ class _Watch:
         """
         began = time.monotonic()
         while time.monotonic() - began < SILENCE_S:
-            name = self.ended()
+            name = ended_process()
             if name:
                 return f"Ray's process {name} has ended: it was killed, or crashed; {CONTINUES}"
-            if self.ask(SILENCE_S / 2):
+            if head_answers(SILENCE_S / 2):
                 return ""
             time.sleep(0.5)
         return (

@@ -1,15 +1,14 @@
 """Select the settings that name a run folder. Folders of older versions keep their names."""
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any
 
-from envs.config import CameraConfig, EnvConfig, FaultsConfig, FidelityConfig
+from envs.config import EnvConfig
 from jobs.config.algorithms import AlgoConfig
-from jobs.config.config import Config, as_dict
-from jobs.config.env_keys import ENV_FIELDS
+from jobs.config.config import SECTIONS, Config, as_dict
+from jobs.config.env_keys import ENV_FIELDS, ENV_GROUPS
 from jobs.config.plugins import plugin_digests
-from jobs.config.schema import CollectConfig, PretrainConfig, RecordingConfig, TrainConfig
 from models.kinds import ADDED_MODEL_SETTINGS
 
 # The settings that can change what is trained: not the job, nor where a run is computed and recorded.
@@ -17,6 +16,7 @@ TRAINED_BY = (
     *("exp", "budget", "seed", "env", "camera", "faults", "renderer", "fidelity"),
     *("model", "algo", "collect", "pretrain", "train"),
 )
+HASHED = (*TRAINED_BY, "recording")
 # The hash has always covered these fields, also at their defaults. Every other field counts only if it
 # differs from its default, so a field that is added to a class renames no folder and needs no row here.
 FIRST = {
@@ -28,23 +28,16 @@ FIRST = {
     "hot_pixel_share hot_pixel_hz",
     "fidelity": "tolerance max_step_m samples cull_m",
 }
-CLASSES: dict[str, type[Any]] = {
-    "env": EnvConfig,
-    "camera": CameraConfig,
-    "faults": FaultsConfig,
-    "fidelity": FidelityConfig,
-    "algo": AlgoConfig,
-    "collect": CollectConfig,
-    "pretrain": PretrainConfig,
-    "train": TrainConfig,
-}
+CLASSES: dict[str, type[Any]] = {"env": EnvConfig, "algo": AlgoConfig, **ENV_GROUPS, **SECTIONS}
 # Settings of two jobs, which older versions hashed for every run: section -> name in the hash, values.
-ALWAYS: dict[str, tuple[str, Mapping[str, object]]] = {
+ALWAYS: dict[str, tuple[str, dict[str, object]]] = {
     "replay": ("replay", {"recording": "events.raw", "policy": "bytestream_hold-s0"}),
     "video_events": (
         "video",
-        {"path": "video.mp4", "output": None, "fps": None, "transfer": None, "interpolate": "linear"}
-        | {"luminance_floor": None},
+        {
+            **{"path": "video.mp4", "output": None, "fps": None, "transfer": None, "interpolate": "linear"},
+            "luminance_floor": None,
+        },
     ),
 }
 
@@ -62,7 +55,7 @@ def _later(section: str, cls: type[Any]) -> Iterator[tuple[str, object]]:
 
 
 # Section -> the fields that older run folders lack, each with the value that reproduces the old behaviour.
-ADDED_SETTINGS = {name: dict(_later(name, cls)) for name, cls in CLASSES.items()}
+ADDED_SETTINGS = {name: dict(_later(name, cls)) for name, cls in CLASSES.items() if name in HASHED}
 ADDED_SETTINGS["model"] = ADDED_MODEL_SETTINGS
 
 
@@ -72,24 +65,16 @@ def identity(config: Config) -> dict[str, Any]:
     The content of plug-ins counts: another version of a plug-in is another experiment. A job's own settings
     do not count, except those in `ALWAYS`.
     """
-    values = as_dict(config)
-    settings: dict[str, Any] = {name: values[name] for name in TRAINED_BY}
+    values: dict[str, Any] = as_dict(config)
+    settings = {name: values[name] for name in HASHED}
     for section, added in ADDED_SETTINGS.items():
         own = settings[section].items()
         settings[section] = {name: value for name, value in own if added.get(name, ...) != value}
-    usual_reading = dataclasses.asdict(RecordingConfig())
-    reading = dataclasses.asdict(config.recording)
-    given = {name: value for name, value in reading.items() if value != usual_reading[name]}
-    settings |= {"recording": given} if given else {}
+    if not settings["recording"]:
+        del settings["recording"]
     for job, (name, usual) in ALWAYS.items():
-        settings[name] = _of_older_versions(usual, values.get(job))
+        own = values.get(job, {}).items()  # of newer fields only those that are not null
+        settings[name] = usual | {key: value for key, value in own if key in usual or value is not None}
     if config.plugins:
         settings["plugins"] = plugin_digests()
     return settings
-
-
-def _of_older_versions(usual: Mapping[str, object], given: object) -> dict[str, object]:
-    """Return the values of the older fields, and of newer fields that are not null."""
-    if not isinstance(given, Mapping):
-        return dict(usual)
-    return {**usual, **{name: value for name, value in given.items() if name in usual or value is not None}}

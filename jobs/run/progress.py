@@ -47,9 +47,9 @@ def progress(title: str, total: int, unit: str, done: int = 0) -> Iterator[Calla
             yield advance
     else:
         lines = _PlainLines(title, total, unit, done)
-        lines.show("")
+        lines.show()
         yield lines.advance
-        lines.show("", final=True)
+        lines.show(final=True)
 
 
 class _PlainLines:
@@ -68,9 +68,9 @@ class _PlainLines:
         self.counted = self.counted or (time.monotonic(), self.done)
         self.note = note or self.note
         if time.monotonic() - self.shown >= PLAIN_LINE_EVERY_S and self.done < self.total:
-            self.show(self.note)
+            self.show()
 
-    def show(self, note: str, final: bool = False) -> None:
+    def show(self, final: bool = False) -> None:
         self.shown = time.monotonic()
         since, first = self.counted or (self.shown, self.done)
         rate = (self.done - first) / (self.shown - since) if self.done > first else 0.0
@@ -79,8 +79,7 @@ class _PlainLines:
             parts.append(f"in {clock(self.shown - self.started)}")
         elif rate > 0:
             parts.append(f"{rate:,.0f}/s, {clock((self.total - self.done) / rate)} left")
-        if note or final:
-            parts.append(note or self.note)
+        parts.append(self.note)
         console.print(" · ".join(part for part in parts if part))
 
 

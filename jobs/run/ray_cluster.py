@@ -14,7 +14,7 @@ from jobs.config.config import ConfigError
 from jobs.config.plugins import with_plugins
 from jobs.config.schema import ClusterConfig
 from jobs.run.compile import compile_kernels
-from jobs.run.device import device_variables
+from jobs.run.device import LEARNER_DEVICE
 from jobs.run.head_watch import watching_head
 from jobs.run.libraries import of_workers
 from jobs.run.locks import locked, private_folder
@@ -26,7 +26,6 @@ from jobs.run.signals import keeping_handlers
 QUIET = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
-    "RAY_DEDUP_LOGS": "1",
     # At Ray's default of 15, a worker gets a thirtieth of a core that another program uses, too.
     "RAY_worker_niceness": "0",
     # On a busy machine a worker takes minutes to start; after one minute, Ray would start a second one.
@@ -83,11 +82,10 @@ def start_ray(cluster: ClusterConfig, folder: Path) -> None:
     # Ray logs the traceback of a trial's error, which it also writes to the trial's folder and jobs report.
     logging.getLogger("ray.tune.execution.tune_controller").setLevel(logging.CRITICAL)
     settings = {
-        "runtime_env": with_plugins({"env_vars": of_workers() | device_variables(cluster.device)}),
+        "runtime_env": with_plugins({"env_vars": of_workers() | {LEARNER_DEVICE: cluster.device}}),
         "job_config": _job_config(),
         "log_to_driver": False,
         "logging_level": logging.ERROR,
-        "configure_logging": True,
     }
     with keeping_handlers():
         if cluster.name == "local":

@@ -76,21 +76,15 @@ def refusing(key: str, path: str | Path) -> Iterator[None]:
     """Convert the errors of a block that reads a file for a command.
 
     Raises:
-        ConfigError: The file cannot be read; the error is that of `refused`.
+        ConfigError: The file cannot be read; the message ends with the keys that the remedy names.
     """
     try:
         yield
     except (ValueError, OSError) as error:
-        raise refused(key, path, error) from error
-
-
-def refused(key: str, path: str | Path, error: Exception) -> ConfigError:
-    """Return a command's error for a file that it cannot read, with the keys that its remedy names."""
-    if not str(error).startswith(str(path)):
-        error = ValueError(f"{path}: {error}")
-    named = [name for name in KEYS if re.search(rf"\b{name}\b", str(error).partition(": ")[2])]
-    spelled = " ".join(f"recording.{name}={EXAMPLES.get(name, name.upper())}" for name in named)
-    return ConfigError(f"{key}: {error}{f' (as {spelled})' if spelled else ''}")
+        said = str(error) if str(error).startswith(str(path)) else f"{path}: {error}"
+        named = [name for name in KEYS if re.search(rf"\b{name}\b", said.partition(": ")[2])]
+        spelled = " ".join(f"recording.{name}={EXAMPLES.get(name, name.upper())}" for name in named)
+        raise ConfigError(f"{key}: {said}{f' (as {spelled})' if spelled else ''}") from error
 
 
 @contextlib.contextmanager

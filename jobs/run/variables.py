@@ -8,12 +8,11 @@ from collections.abc import Iterator, Mapping
 @contextlib.contextmanager
 def variables_set(values: Mapping[str, str]) -> Iterator[None]:
     """Set environment variables for a block, and restore them afterwards."""
-    before = {name: os.environ.get(name) for name in values}
+    before = {name: os.environ[name] for name in values if name in os.environ}
     os.environ.update(values)
     try:
         yield
     finally:
-        for name, value in before.items():
+        for name in values:
             os.environ.pop(name, None)
-            if value is not None:
-                os.environ[name] = value
+        os.environ.update(before)

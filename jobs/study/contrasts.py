@@ -8,7 +8,6 @@ large, or both. `Finding.excluded` says whether such an exclusion is also certai
 import math
 from collections.abc import Mapping, Sequence
 from itertools import compress
-from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -51,8 +50,8 @@ class Finding(NamedTuple):
     difference: Difference | None
     adjusted_p: float | None
     verdict: str
-    needed: int | None = None
-    excluded: Mapping[str, bool] = MappingProxyType({})
+    needed: int | None
+    excluded: Mapping[str, bool]
 
 
 def judge(family: Family, results: Results, learned: Learned | None = None) -> list[Finding]:
@@ -239,9 +238,9 @@ class Row(NamedTuple):
 
 def by_condition(contrast: Contrast, results: Results) -> list[Row]:
     """Split a test of two groups into its conditions; return success and difference under each."""
-    rows, other = [], contrast.theirs
-    for at in contrast.ours.at if other is not None else ():
-        theirs_at = None if other is None else other._replace(at=(at,))
+    rows = []
+    for at in contrast.ours.at:
+        theirs_at = contrast.theirs and contrast.theirs._replace(at=(at,))
         one = contrast._replace(ours=contrast.ours._replace(at=(at,)), theirs=theirs_at)
         ours, theirs = compared_values(one, results, {})
         difference = _difference(one, ours, theirs)

@@ -9,7 +9,7 @@ from envs.config import EnvConfig
 from envs.event_error import error_between
 from jobs.analysis.tables import write_csv
 from jobs.config.env_keys import env_with
-from jobs.study.results import Condition, Results, place, text_of
+from jobs.study.results import Condition, Results, place, texts_of
 
 HEAD = ("Axis", "Value", "asked_event_error", "measured_event_error", "met_by")
 
@@ -51,7 +51,7 @@ def measure_doses(study: Mapping[str, Any], results: Results, env: EnvConfig) ->
 def write_doses(file: Path, doses: Sequence[Dose]) -> None:
     """Write the table of the doses for `read_doses`."""
     rows = [
-        (one.condition[0], text_of(one.condition[1]), "" if one.asked is None else f"{one.asked:.4f}",
+        (*texts_of(one.condition), "" if one.asked is None else f"{one.asked:.4f}",
          f"{one.measured:.4f}", " ".join(one.met_by))
         for one in doses
     ]  # fmt: skip

@@ -1,8 +1,8 @@
 """Figures of a study's page, one function for each `kind` that its file can name."""
 
 import textwrap
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, cast
+from collections.abc import Callable, Sequence
+from typing import cast
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,7 +15,6 @@ from jobs.analysis.plots import panel_grid, style_of, tidy
 from jobs.analysis.statistics import Difference
 from jobs.config.conditions import NOMINAL, axis_numbers
 from jobs.rollout.agents import BASELINES
-from jobs.rollout.episodes import EPISODE
 from jobs.study.changes import Change, content
 from jobs.study.computed import Study
 from jobs.study.contrasts import Finding
@@ -141,7 +140,7 @@ def worst_conditions(results: Results, changes: Sequence[Change]) -> dict[str, C
 def survival(study: Study, said: Section) -> Figure:
     """Draw the share of episodes still running over distance, in the nominal and in the worst condition."""
     results, worst = study.results, worst_conditions(study.results, study.changes)
-    length_m = _scene(results).length_m
+    length_m = make_scene(results.facts["scene"], np.random.default_rng(0)).length_m
     figure, panels = panel_grid(max(len(worst), 1), 4, (2.9, 2.2), (0.4, 0.5), sharex=True, sharey=True)
     for panel, (group, at) in zip(panels, worst.items(), strict=bool(worst)):
         for place, colour in ((results.nominal, BLUE), (at, RED)):
@@ -159,10 +158,6 @@ def survival(study: Study, said: Section) -> Figure:
     figure.supxlabel("Distance travelled [m]", fontsize=9)
     figure.supylabel("Episodes still going [%]", fontsize=9)
     return figure
-
-
-def _scene(results: Results) -> Any:
-    return make_scene(results.facts["scene"], np.random.default_rng(0))
 
 
 def numeric_axes(results: Results) -> list[str]:
@@ -209,69 +204,6 @@ def _draw_group(panel: Axes, found: Sequence[Summary], values: Sequence[object],
     panel.vlines(x + place, ends[:, 0], ends[:, 1], color=colour, alpha=0.5, lw=1.2, zorder=2)
     name = found[0].group if found else ""
     panel.plot(x + place, y, color=colour, marker=marker, ms=5, lw=1.6, zorder=3, label=name)
-
-
-def contacts(study: Study, said: Section) -> Figure:
-    """Draw the places where episodes end in contact, seen from above."""
-    scene = _scene(study.results)
-    return contact_map(contact_ends(study.results), scene.length_m, scene.width_m / 2)
-
-
-def contact_map(
-    ends: Mapping[str, tuple[np.ndarray, np.ndarray]], length_m: float, half_width_m: float
-) -> Figure:
-    """Draw the places where episodes of each group ended in contact.
-
-    Args:
-        ends: Group -> EPISODE in the nominal condition, and EPISODE under all changes in the same scene.
-        length_m: Distance of the goal line [m].
-        half_width_m: Distance of the walls from the middle [m].
-    """
-    figure, panels = panel_grid(len(ends), 2, (6.6, 2.3), (0.0, 0.7), sharex=True, sharey=True)
-    for panel, (group, (unchanged, changed)) in zip(panels, ends.items(), strict=True):
-        _draw_contacts(panel, group, unchanged, changed)
-        panel.hlines([-half_width_m, half_width_m], 0, length_m, color=INK, lw=1.5)
-        panel.vlines(length_m, -half_width_m, half_width_m, color=MUTED, lw=1.2, ls=":")
-        panel.set(xlim=(-2, length_m + 2), ylim=(half_width_m + 1.5, -half_width_m - 1.5))
-    figure.supxlabel(
-        "y, along the corridor [m]; large dots: nothing changed, small dots: with changes in the same scene",
-        fontsize=8,
-    )
-    figure.supylabel("x, to the right [m]", fontsize=8)
-    return figure
-
-
-def _draw_contacts(panel: Axes, group: str, unchanged: np.ndarray, changed: np.ndarray) -> None:
-    """Draw the contacts of one group as dots, large for the nominal condition."""
-    colour, usual, others = style_of(group)[0], *(rows[rows["collision"]] for rows in (unchanged, changed))
-    panel.scatter(usual["distance_m"], usual["x_m"], s=26, alpha=0.95, color=colour, edgecolors="white",
-                  lw=0.5, zorder=3)  # fmt: skip
-    panel.scatter(others["distance_m"], others["x_m"], s=7, alpha=0.25, color=colour, lw=0, zorder=2)
-    counts = f"unchanged {len(usual)} of {len(unchanged)}, changed {len(others)} of {len(changed)}"
-    panel.set_title(f"{group}: contacts {counts}", loc="left", fontsize=9, color=INK)
-    panel.spines[:].set_visible(False)
-    panel.tick_params(labelsize=8, labelbottom=True, labelleft=True)
-
-
-def contact_ends(results: Results) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Return group -> EPISODE in the nominal condition, and under all changes in the same scene.
-
-    Equal simulations count once. Which are equal depends on the group: event faults do not affect a policy
-    that sees no events.
-    """
-    usual = results.facts["scene"]
-    here = [at for at in results.conditions if results.axes[at[0]][at[1]].get("env.scene", usual) == usual]
-    here.sort(key=lambda at: at[0] != NOMINAL)
-    found, none = {}, np.empty(0, EPISODE)
-    for group in results.groups:
-        first: dict[bytes, Condition] = {}
-        for at in here:
-            first.setdefault(content(results.trainings(at, group)), at)
-        parts: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
-        for at in first.values():
-            parts[at[0] != NOMINAL].extend(results.trainings(at, group).values())
-        found[group] = np.concatenate([none, *parts[0]]), np.concatenate([none, *parts[1]])
-    return found
 
 
 def lines(study: Study, said: Section) -> Figure:
@@ -421,7 +353,6 @@ KINDS: dict[str, Callable[[Study, Section], Figure]] = {
     "forest": forest,
     "survival": survival,
     "axes": axes_map,
-    "contacts": contacts,
     "doses": dose_figure,
     "lines": lines,
     "dots": dots,
@@ -445,8 +376,6 @@ CAPTIONS = {
     "all. Blue: nothing changed. Red: the condition in which the group succeeds least, named above.",
     "axes": "Success along every axis of numbers. Markers: means of the named groups with 95 % intervals, "
     "shifted sideways. Grey: the other groups. Values stand at equal distances.",
-    "contacts": "Where episodes end in contact, all corridors laid over each other: large dots with "
-    "nothing changed, small ones under all changes in the same scene.",
     "doses": "Change of success against the measured event error. The 95 % intervals are not adjusted; "
     "markers are shifted sideways. Hollow: a training of the group met as much of that kind.",
     "lines": "Success against control rate. A marker is one training, shifted sideways; a line is the "

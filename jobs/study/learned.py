@@ -33,16 +33,13 @@ def learned(study: Mapping[str, Any], groups: Iterable[str]) -> Learned:
         study: Section `study` of its file.
         groups: The groups in its results.
     """
-    places = {group: published_place(study, group) for group in groups}
-    curves = {
-        folder: published_trainings(folder)
-        for folder in {place.parent for place in places.values() if place is not None}
-    }
+    places = {group: at for group in groups if (at := published_place(study, group)) is not None}
+    curves = {folder: published_trainings(folder) for folder in {place.parent for place in places.values()}}
     found: dict[str, dict[str, list[float]]] = {"learned": {}, "learned_uncharged": {}}
     for group, place in places.items():
-        for one in curves[place.parent] if place is not None else ():
+        for one in curves[place.parent]:
             for measure, value in (("learned", one.mean_success_with_encoder),
                                    ("learned_uncharged", one.mean_success)):  # fmt: skip
-                if one.group == place.name and value is not None:  # type: ignore[union-attr]
+                if one.group == place.name and value is not None:
                     found[measure].setdefault(group, []).append(value)
     return found

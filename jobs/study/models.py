@@ -4,8 +4,6 @@ Run: evade models
 Expect: tables in seconds; docs/models.md has the same, written by python -m docs.tables.
 """
 
-import csv
-import gzip
 import itertools
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -19,7 +17,8 @@ from jobs.rollout.policies import PRETRAINED
 from jobs.run.files import read_json
 from jobs.run.progress import console
 from jobs.run.provenance import REPOSITORY
-from jobs.study.results import place
+from jobs.study.changes import content
+from jobs.study.results import Condition, read_cells, values_of
 from jobs.study.words import condition_text
 
 DATA = REPOSITORY / "docs" / "data"
@@ -42,8 +41,6 @@ TAUGHT = "taught_"  # prefix of the policies of the study `taught`
 # File of a study -> prefix of its groups' names.
 EPISODES = {"robustness": "", "taught": TAUGHT, "body_conditions": ""}
 LOAD = 'load_policy(PRETRAINED / "bytestream_hold-s0")'
-
-Condition = tuple[str, str]
 
 
 class Success(NamedTuple):
@@ -129,18 +126,15 @@ def success_rates(episodes: Path) -> dict[str, Success]:
     """
     if not episodes.is_file():
         return {}
-    wins: dict[str, dict[Condition, list[bool]]] = defaultdict(lambda: defaultdict(list))
-    content: dict[Condition, list[str]] = defaultdict(list)
-    with gzip.open(episodes, "rt", newline="") as file:
-        for row in csv.DictReader(file):
-            at = row.pop("Axis"), row.pop("Value")
-            wins[row["Group"]][at].append(row["success"] == "True")
-            content[at].append(",".join(row.values()))
-    distinct = {tuple(sorted(rows)): at for at, rows in reversed(list(content.items()))}
-    kept = set(distinct.values())
+    bytes_at: dict[Condition, dict[str, bytes]] = defaultdict(dict)
+    rates: dict[str, dict[Condition, float]] = defaultdict(dict)
+    for (at, group), trainings in read_cells(episodes).items():
+        bytes_at[at][group] = content(trainings)
+        rates[group][at] = float(values_of(trainings, "success").mean())
+    first = {tuple(own.items()): at for at, own in reversed(bytes_at.items())}
+    kept = set(first.values())
     return {
-        group: _success({at: sum(own) / len(own) for at, own in found.items() if at in kept})
-        for group, found in wins.items()
+        group: _success({at: rate for at, rate in own.items() if at in kept}) for group, own in rates.items()
     }
 
 
@@ -175,7 +169,7 @@ def _row(group: Group, success: Success) -> tuple[str, ...]:
         f"{group.env_steps / 1e3:,.0f}k",
         f"{group.megabytes:.1f}",
         *(f"{100 * rate:.0f}" for rate in (success.nominal, success.mean, success.worst)),
-        condition_text(place(success.condition)),
+        condition_text(success.condition),
     )
 
 
@@ -188,9 +182,9 @@ def _ranges(seeds: Sequence[int]) -> str:
     return ", ".join(f"{own[0]}-{own[-1]}" if len(own) > 1 else str(own[0]) for own in runs)
 
 
-def models_tables(folder: Path = PRETRAINED, data: Path = DATA) -> dict[str, str]:
+def models_tables() -> dict[str, str]:
     """Return the tables of docs/models.md: name of the study -> Markdown."""
-    named = {study: model_rows(study, folder, data) for study in EPISODES}
+    named = {study: model_rows(study, PRETRAINED, DATA) for study in EPISODES}
     return {
         study: markdown_table(HEAD, [(f"`{name}`", *cells) for name, *cells in rows], WORDS)
         for study, rows in named.items()

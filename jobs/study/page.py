@@ -192,21 +192,14 @@ def _changes(study: Study, _: str) -> str:
     return f"{note}\n\n{tables.change_table(study.changes, study.doses)}"
 
 
-def _losses(study: Study, which: str) -> str:
-    """Return the losses of each group; for `certain` only losses that are certain for other trainings."""
+def _losses(study: Study, _: str) -> str:
+    """Return the losses of each group that are certain for other trainings."""
     tests = len(replicated(study.changes))
-    if which == "certain":
-        note = (
-            f"Certain for other trainings, among all {tests} changes (Benjamini and Hochberg) [points]; in "
-            "brackets, how many trainings certainly lose by themselves."
-        )
-        return f"{note}\n\n{tables.certain_losses_table(study.results, study.changes)}"
     note = (
-        f'"2 of 3": so many of these trainings certainly lose, by McNemar\'s exact test over the corridors; '
-        f"all such tests are one family (Benjamini and Hochberg). The interval is over trainings; **bold**: "
-        f"certain for other trainings, among all {tests} such tests."
+        f"Certain for other trainings, among all {tests} changes (Benjamini and Hochberg) [points]; in "
+        "brackets, how many trainings certainly lose by themselves."
     )
-    return f"{note}\n\n{tables.losses_table(study.results, study.changes)}"
+    return f"{note}\n\n{tables.certain_losses_table(study.results, study.changes)}"
 
 
 def _headline(study: Study, _: str) -> str:
@@ -258,6 +251,5 @@ PARTS: dict[str, Callable[[Study, str], str]] = {
     "changes": _changes,
     "losses": _losses,
     "headline": _headline,
-    "errors": lambda study, _: tables.errors_table(study.results),
     "provenance": _provenance,
 }

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import pydantic
@@ -39,10 +39,10 @@ class Plan:
     differences: dict[str, Differences]
     axes: Axes
     tasks: tuple[EvaluationTask, ...]
-    met: frozenset[tuple[Condition, str]] = frozenset()
-    baselines: Mapping[Condition, Condition] = field(default_factory=dict)
-    own_baselines: Mapping[str, Mapping[Condition, Condition]] = field(default_factory=dict)
-    same_as: Mapping[Condition, Condition] = field(default_factory=dict)
+    met: frozenset[tuple[Condition, str]]
+    baselines: Mapping[Condition, Condition]
+    own_baselines: Mapping[str, Mapping[Condition, Condition]]
+    same_as: Mapping[Condition, Condition]
 
     @property
     def identity(self) -> str:

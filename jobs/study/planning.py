@@ -74,7 +74,7 @@ def main(words: Sequence[str]) -> None:
     asked = parser.parse_args(words)
     design = f"{asked.trainings} trainings of each group in {asked.corridors} corridors"
     rows = plan_rows(asked.study, asked.trainings, asked.corridors)
-    show_table(f"{design}, by the spread in {asked.study}", HEAD, rows, 2, None)
+    show_table(f"{design}, by the spread in {asked.study}", HEAD, rows, 2)
 
 
 if __name__ == "__main__":

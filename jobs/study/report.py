@@ -175,7 +175,6 @@ def write_values(folder: Path, study: Study) -> None:
 
 def write_figures(images: Path, drawn: Mapping[str, Figure]) -> None:
     """Save figures under their names as optimized PNG files."""
-    images.mkdir(parents=True, exist_ok=True)
     for name, figure in drawn.items():
         picture = images / f"{name}.png"
         save_plot(picture, figure)
@@ -212,10 +211,8 @@ def write_trade(trade: Path, docs: Path) -> Path:
         trade: The trade's folder in its run folder.
         docs: Target folder of trade.md; the plot goes into `images`, the settings into `data`.
     """
-    (docs / "images").mkdir(parents=True, exist_ok=True)
     copy_plot(trade / "images" / "trade.png", docs / "images" / "trade.png")
     if (trade / "settings.csv").is_file():  # missing in trades of earlier versions
-        (docs / "data").mkdir(exist_ok=True)
         write_atomic(docs / "data" / "trade_settings.csv", (trade / "settings.csv").read_text())
     write_atomic(docs / "trade.md", (trade / "trade.md").read_text())
     return docs / "trade.md"

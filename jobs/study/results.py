@@ -86,7 +86,7 @@ class Results:
         """Return the first condition of each different simulation, including the nominal condition."""
         return [at for at in self.conditions if self.same_as.get(at, at) == at]
 
-    def is_baseline(self, at: Condition, group: str | None = None) -> bool:
+    def is_baseline(self, at: Condition, group: str) -> bool:
         """Whether a condition is the same simulation as the group's baseline there."""
         usual = self.baselines(group).get(at, at)
         return self.same_as.get(at, at) == self.same_as.get(usual, usual)
@@ -100,9 +100,9 @@ class Results:
         """Return training seed -> its episodes; empty if nothing was evaluated."""
         return self.cells.get((at, group), {})
 
-    def values(self, at: Condition, group: str, measure: str = "success") -> np.ndarray:
-        """Return a measure of all trainings of a group under a condition, float64 (trainings, corridors)."""
-        return values_of(self.cells[at, group], measure)
+    def values(self, at: Condition, group: str) -> np.ndarray:
+        """Return the success of a group's trainings under a condition, float64 (trainings, corridors)."""
+        return values_of(self.cells[at, group], "success")
 
     @property
     def _compared(self) -> Sequence[Mapping[str, Any]]:
@@ -184,12 +184,16 @@ def read_published(data: Path, name: str) -> Results:
 
 def write_cells(file: Path, cells: Cells) -> None:
     """Write the episodes of a study, plain or packed (.gz)."""
-    rows = {
-        (axis, text_of(value), group, "" if seed is None else seed): own
-        for ((axis, value), group), trainings in cells.items()
+    write_episodes(file, LABELS, _labelled(cells))
+
+
+def _labelled(cells: Cells) -> dict[tuple[object, ...], np.ndarray]:
+    """Return axis, value, group and training, as files store them -> episodes."""
+    return {
+        (*texts_of(at), group, "" if seed is None else seed): own
+        for (at, group), trainings in cells.items()
         for seed, own in trainings.items()
     }
-    write_episodes(file, LABELS, rows)
 
 
 def joined(earlier: Results, more: Results) -> Results:
@@ -261,16 +265,13 @@ def publish(data: Path, name: str, results: Results) -> None:
         name: Name of the study.
         results: Its results.
     """
-    data.mkdir(parents=True, exist_ok=True)
     write_cells(data / f"{name}_episodes.csv.gz", results.cells)
     facts = {key: value for key, value in results.facts.items() if key != "host"}  # a local name
     write_json(data / f"{name}_about.json", facts)
     rows = [
-        (axis, text_of(value), group, "" if seed is None else seed, len(own),
-         f"{own['success'].mean():.4f}", f"{own['distance_m'].mean():.2f}")
-        for ((axis, value), group), trainings in results.cells.items()
-        for seed, own in trainings.items()
-    ]  # fmt: skip
+        (*label, len(own), f"{own['success'].mean():.4f}", f"{own['distance_m'].mean():.2f}")
+        for label, own in _labelled(results.cells).items()
+    ]
     write_csv(data / f"{name}_trainings.csv", (*LABELS, "episodes", "success_rate", "distance_m"), rows)
 
 

@@ -9,7 +9,6 @@ subtracted.
 import itertools
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import yaml
@@ -24,10 +23,8 @@ Section = Mapping[str, Any]  # of a study's file; plain data, no class defines i
 # Default of the smallest difference that matters. 5 m correspond to 10 points of success: over the trainings
 # of ppo_claims and taught_claims one point goes with 0.55 and 0.50 m.
 GAIN = {"success": 0.1, "distance_m": 5.0}
-LEARNED = (
-    "learned",
-    "learned_uncharged",
-)  # measures of learning curves, with and without the encoder's steps
+# Measures of learning curves, with and without the encoder's steps.
+LEARNED = ("learned", "learned_uncharged")
 # `pair` of a test -> whether its sides are compared training seed by training seed.
 PAIRED = {"seed": True, "none": False}
 KEYS = ("name", "source", "ours", "theirs", "measure", "at", "less", "pair", "for", "contrasts")
@@ -108,27 +105,26 @@ class Family(NamedTuple):
     alias: Mapping[str, str]
 
 
-def read_study(name: str, conf: Path = CONF) -> dict[str, Any]:
+def read_study(name: str) -> dict[str, Any]:
     """Read the section `study` of conf/exp/NAME.yaml; empty if there is no such file."""
-    file = conf / "exp" / f"{name}.yaml"
+    file = CONF / "exp" / f"{name}.yaml"
     found = yaml.safe_load(file.read_text()) if file.is_file() else None
     return dict((found or {}).get("study") or {})
 
 
-def families_of(study: Section, results: Results, conf: Path = CONF) -> list[Family]:
+def families_of(study: Section, results: Results) -> list[Family]:
     """Return the families of a study, without tests of groups that its results lack.
 
     Args:
         study: Section `study` of its file.
         results: The study's results.
-        conf: Folder with the shared families in `claims`.
 
     Raises:
         ConfigError: A family has a wrong key or value.
     """
     tags = tags_of(study, results)
     return [
-        _family(name, _shared(name, said, conf), tags, results)
+        _family(name, _shared(name, said), tags, results)
         for name, said in (study.get("families") or {}).items()
         if said is not None
     ]
@@ -142,17 +138,17 @@ def tags_of(study: Section, results: Results) -> dict[str, dict[str, Any]]:
     }
 
 
-def _shared(name: str, said: object, conf: Path) -> dict[str, Any]:
+def _shared(name: str, said: object) -> dict[str, Any]:
     """Return a family merged with the file of conf/claims that it uses, which may use another one."""
     own = {"use": said} if isinstance(said, str) else dict(said) if isinstance(said, Mapping) else None
     if own is None:
         raise ConfigError(f"study.families.{name}: must be a family or a file of conf/claims, got {said!r}")
     used = own.pop("use", None)
     if used is not None:
-        file = conf / "claims" / f"{used}.yaml"
+        file = CONF / "claims" / f"{used}.yaml"
         if not file.is_file():
             raise ConfigError(f"study.families.{name}: must name a file of conf/claims, got {used!r}")
-        own = {**_shared(name, yaml.safe_load(file.read_text()), conf), **own}
+        own = {**_shared(name, yaml.safe_load(file.read_text())), **own}
     return own
 
 

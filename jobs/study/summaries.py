@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from jobs.analysis.statistics import Difference, Estimate, crossed_difference, crossed_mean, rate_estimate
 from jobs.analysis.tables import estimate_metrics, estimate_text, events_texts, markdown_table, percent_text
 from jobs.study.contrasts import reach
-from jobs.study.results import RATE, Condition, Results, Trainings, text_of, values_of
+from jobs.study.results import RATE, Condition, Results, Trainings, text_of, texts_of, values_of
 
 MET = "°"  # marks a result whose condition lies within the group's training distribution
 
@@ -108,10 +108,7 @@ def success_lines(
     for one in found:
         at = one.condition, one.group
         cells[at] = percent_text(one.success) + (MET if at in results.met else "")
-    lines = [
-        (at[0], text_of(at[1]), *(cells.get((at, group), "-") for group in results.groups))
-        for at in conditions
-    ]
+    lines = [(*texts_of(at), *(cells.get((at, group), "-") for group in results.groups)) for at in conditions]
     return ("Axis", "Value", *results.groups), lines
 
 
@@ -121,8 +118,7 @@ def details_table(found: Sequence[Summary], reference: str) -> str:
     head = (*own, f"Success - {reference}", f"Distance - {reference} [m]", "Events/step", "Dropped")
     lines = [
         (
-            one.condition[0],
-            text_of(one.condition[1]),
+            *texts_of(one.condition),
             one.group,
             str(len(one.trainings)),
             str(one.episodes),

@@ -12,7 +12,7 @@ from jobs.analysis.tables import estimate_text, markdown_table, percent_text, wr
 from jobs.study.changes import Change, replicated
 from jobs.study.contrasts import UNDECIDED, Finding, Row, by_condition
 from jobs.study.doses import Dose
-from jobs.study.results import RATE, Condition, Results, place, text_of
+from jobs.study.results import RATE, Condition, Results, texts_of
 from jobs.study.spec import LEARNED, Contrast, Family
 from jobs.study.spread import Factors
 from jobs.study.summaries import MET, Summary
@@ -268,24 +268,6 @@ def _against(at: Condition, baseline: Condition) -> str:
     return condition_text(at) + ("" if usual == "nothing changed" else f" against {usual}")
 
 
-def losses_table(results: Results, changes: Sequence[Change]) -> str:
-    """Return a line per group: nominal success, largest drop, and its certain losses, the worst first."""
-    lines = []
-    for group in results.trained:
-        own = [change for change in changes if change.group == group]
-        lost = [change for change in own if change.broken.any() or (change.certain and change.loses)]
-        lost.sort(key=lambda change: (-change.broken.mean(), change.difference.value))
-        if own:
-            worst = min(own, key=lambda change: change.difference.value)
-            before = (f"{100 * results.values(results.nominal, group).mean():.0f}"
-                      if (results.nominal, group) in results.cells else "-")  # fmt: skip
-            texts = [_loss_text(change) for change in lost]
-            lines.append((f"`{group}` ({len(results.groups[group])})", before,
-                          _drop_text(worst) if worst.loses else "-", "; ".join(texts) or "none"))  # fmt: skip
-    head = ("Group (trainings)", "Nothing changed [%]", "Largest drop of the mean", "Certain losses")
-    return markdown_table(head, lines, len(head))
-
-
 def certain_losses_table(results: Results, changes: Sequence[Change]) -> str:
     """Return a line per group with the losses that are certain for other trainings, the largest first."""
     lines = []
@@ -303,12 +285,6 @@ def certain_losses_table(results: Results, changes: Sequence[Change]) -> str:
 def _drop_text(change: Change) -> str:
     before, success = 100 * change.before.mean(), 100 * change.success.mean()
     return f"{condition_text(change.condition)}: {before:.0f} to {success:.0f} %"
-
-
-def _loss_text(change: Change) -> str:
-    difference = estimate_text(change.difference, 100, "+.0f")
-    said = f"{condition_text(change.condition)}: {difference}, {change.broken.sum()} of {len(change.broken)}"
-    return f"**{said}**" if change.certain else said
 
 
 def broken_table(changes: Sequence[Change]) -> str:
@@ -411,22 +387,11 @@ def spread_sentence(overall: Factors, names: tuple[str, str], mean: np.ndarray) 
     )
 
 
-def errors_table(results: Results) -> str:
-    """Return the requested and the measured event error of each condition; "" if not measured."""
-    lines = [
-        (condition_text(place(one["condition"])), f"{100 * one['asked']:g}",
-         f"{100 * one['event_error']:.1f}", f"{one['renders_per_step']:.1f}")
-        for one in results.facts.get("exactness", ())
-    ]  # fmt: skip
-    head = ("Condition", "Event error asked [%]", "achieved [%]", "Renders a step")
-    return markdown_table(head, lines) if lines else ""
-
-
 def write_estimates(file: Path, found: Sequence[Summary]) -> None:
     """Write every estimate with its interval as CSV."""
     rows = [
         (
-            *(one.condition[0], text_of(one.condition[1]), one.group, len(one.trainings), one.episodes),
+            *(*texts_of(one.condition), one.group, len(one.trainings), one.episodes),
             *_numbers(one.success, ".4f"),
             *_numbers(one.distance_m, ".2f"),
             *(f"{one.events_per_step:.1f}", one.dropped),
@@ -440,8 +405,8 @@ def write_changes(file: Path, changes: Sequence[Change]) -> None:
     """Write every change against its baseline as CSV."""
     rows = [
         (
-            *(one.condition[0], text_of(one.condition[1]), one.group),
-            *(one.baseline[0], text_of(one.baseline[1]), len(one.success)),
+            *(*texts_of(one.condition), one.group),
+            *(*texts_of(one.baseline), len(one.success)),
             *(f"{one.success.mean():.4f}", f"{one.before.mean():.4f}"),
             *_numbers(one.difference, ".4f"),
             *(

@@ -55,7 +55,7 @@ def published_policies(config: Config) -> dict[Training, Path]:
     Raises:
         ConfigError: A training is missing, or its manifest says that it used other settings.
     """
-    said, found, wrong = {**dataclasses.asdict(config.own)}, {}, []
+    said, found, wrong = dataclasses.asdict(config.own), {}, []
     for name, seed in trainings_of(config):
         place = published_place(said, name)
         if place is None:

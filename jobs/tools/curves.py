@@ -84,9 +84,8 @@ def _published(folder: Path, curve: Curve) -> PublishedTraining:
     manifest = read_json(place / MANIFEST)
     steps, iterations = 0, 0
     if (place / ENCODER).is_file():
-        collect = manifest.get("collect", {})
-        steps = int(collect.get("num_steps", 0)) + int(collect.get("num_validation_steps", 0))
-        iterations = int(manifest.get("pretrain", {}).get("iterations", 0))
+        steps = manifest["collect"]["num_steps"] + manifest["collect"]["num_validation_steps"]
+        iterations = manifest["pretrain"]["iterations"]
     last = int(curve.env_steps[-1])
     long = last >= COMPARED_STEPS
     return PublishedTraining(

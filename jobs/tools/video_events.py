@@ -17,7 +17,7 @@ from pydantic.dataclasses import dataclass
 
 from envs.config import STRICT
 from envs.recordings import event_writer
-from envs.recordings.formats import LABELLED, WRITERS, WRITTEN_SUFFIXES
+from envs.recordings.formats import LABELLED, WRITTEN_SUFFIXES
 from envs.recordings.video import VideoStep, video_steps
 from jobs.analysis.tables import show_table
 from jobs.config.config import Config, ConfigError
@@ -62,9 +62,9 @@ def run(config: Config) -> Path:
         ConfigError: The video is invalid, or `video_events.output` cannot store its events.
     """
     output = Path(config.own.output or open_run(config).path / "video" / "events.npz")
-    kind = WRITTEN_SUFFIXES.get(output.suffix.lower(), "")
-    if kind not in WRITERS:
-        known = ", ".join(suffix for suffix, name in WRITTEN_SUFFIXES.items() if name in WRITERS)
+    kind = WRITTEN_SUFFIXES.get(output.suffix.lower())
+    if kind is None:
+        known = ", ".join(WRITTEN_SUFFIXES)
         raise ConfigError(f"video_events.output: must end in one of {known}, got {output.name!r}")
     camera, chosen = config.env.camera, config.own
     steps = video_steps(
@@ -76,8 +76,9 @@ def run(config: Config) -> Path:
         interpolate=chosen.interpolate,
         rng=np.random.default_rng(config.seed),
     )
-    counts, said = write_steps(steps, output, kind, (camera.width, camera.height))
-    show_table("The events of a video", HEADINGS, [line(Path(chosen.path).name, counts)])
+    size = camera.width, camera.height
+    counts, said = write_steps(steps, output, kind, size)
+    show_table("The events of a video", HEADINGS, [line(Path(chosen.path).name, size, counts)])
     for warning in said:
         console.print(warning)
     unlabelled = "" if kind in LABELLED else f" ({kind} stores no labels of noise; npz and hdf5 do)"
@@ -92,7 +93,6 @@ class Counts:
     Attributes:
         events, on, noise, dropped: Numbers of events: all, ON, noise, lost.
         first_us, last_us: Times of the first and the last event [us].
-        width, height: Pixels of the camera.
         missed: As in `envs.recordings.video.VideoStep`.
     """
 
@@ -102,8 +102,6 @@ class Counts:
     dropped: int = 0
     first_us: int = 0
     last_us: int = 0
-    width: int = 0
-    height: int = 0
     missed: float | None = None
 
     def add(self, step: VideoStep) -> None:
@@ -115,7 +113,7 @@ class Counts:
         self.on += int(np.count_nonzero(step.events["p"] > 0))
         self.noise += int(np.count_nonzero(step.is_noise))
         self.dropped += step.dropped
-        self.width, self.height, self.missed = step.width, step.height, step.missed
+        self.missed = step.missed
 
 
 def write_steps(
@@ -126,19 +124,18 @@ def write_steps(
     Raises:
         ConfigError: The video is invalid, or the format cannot store its events.
     """
-    counts, is_labelled, told, frames = Counts(), kind in LABELLED, time.monotonic(), 0
+    counts, is_labelled, told = Counts(), kind in LABELLED, time.monotonic()
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always", UserWarning)
         try:
             with event_writer(output, *size, kind, is_labelled=is_labelled) as write:
-                for step in _refusing(steps):
+                for number, step in enumerate(_refusing(steps), 1):
                     write(step.events, step.is_noise if is_labelled else None)
                     counts.add(step)
-                    frames += 1
                     if time.monotonic() - told > TELL_EVERY_S:
                         told = time.monotonic()
                         console.print(
-                            f"Frame {frames:,}, {step.t_us / SECOND_US:.2f} s: "
+                            f"Frame {number:,}, {step.t_us / SECOND_US:.2f} s: "
                             f"{counts.events / 1e6:,.1f} million events",
                         )
         except ConfigError:
@@ -156,13 +153,14 @@ def _refusing(steps: Iterator[VideoStep]) -> Iterator[VideoStep]:
         raise ConfigError(f"video_events.path: {error}") from error
 
 
-def line(name: str, counts: Counts) -> tuple[str, ...]:
+def line(name: str, size: tuple[int, int], counts: Counts) -> tuple[str, ...]:
     """Return a row of the table."""
+    width, height = size
     span_s = (counts.last_us - counts.first_us) / SECOND_US
-    rate = counts.events / (counts.width * counts.height) / span_s if span_s else None
+    rate = counts.events / (width * height) / span_s if span_s else None
     return (
         name,
-        f"{counts.width}x{counts.height}",
+        f"{width}x{height}",
         f"{span_s:.2f}",
         f"{counts.events:,}",
         "-" if rate is None else f"{rate:.2f}",

@@ -15,13 +15,8 @@ from jobs.run.provenance import REPOSITORY
 SECTIONS = ("collect", "evae", "train", "eval", "sim", "perf", "sweep", "tune")
 MAX_METRICS = 40  # of one call; a page with hundreds of charts can be neither read nor drawn
 MAX_PARAM_CHARACTERS = 6000  # MLflow cuts longer values and only warns
-SCHEMES = (
-    "sqlite:///",
-    "http://",
-    "https://",
-    "postgresql",
-    "mysql",
-)  # of addresses that MLflow supports for runs
+# Of addresses that MLflow supports for runs.
+SCHEMES = ("sqlite:///", "http://", "https://", "postgresql", "mysql")
 RULE = "must begin with sqlite:/// or http:// or https://"
 LOCAL_PAGE = "http://127.0.0.1:5000"
 

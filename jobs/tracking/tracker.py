@@ -52,13 +52,7 @@ from jobs.tracking.pages import (
     usual_views,
     view_address,
 )
-from jobs.tracking.retry_queue import (
-    MANY_RETRIES,
-    NO_RETRIES,
-    LoggedStep,
-    RetryQueue,
-    StoreUnavailable,
-)
+from jobs.tracking.retry_queue import MANY_RETRIES, NO_RETRIES, LoggedStep, RetryQueue, StoreUnavailable
 from jobs.tracking.store import (
     check_metrics,
     dashboard_command,
@@ -276,7 +270,7 @@ def open_tracker(config: Config, folder: Run, key: str = "run") -> Iterator[Trac
         client, experiment_id = open_store(uri, config.tracking.experiment, config.cluster.storage)
         waiting = folder.path / f"undelivered-{quote(key, safe='')}.jsonl"
         store = Tracker(client, redacted(uri), experiment_id, "", RetryQueue(waiting))
-        tracker = _continue_or_create(store, folder, key, name, {"kind": key})
+        tracker = _continue_or_create(store, folder, key, name)
         with _ended(tracker):
             tracker.params(as_dict(folder.config))
             tracker.tags({**facts, "mlflow.source.git.commit": facts["commit"]})
@@ -349,7 +343,7 @@ def _terminate(tracker: Tracker, status: str) -> None:
     tracker.client.set_terminated(tracker.run_id, status, max(start_ms, now_ms()))
 
 
-def _continue_or_create(near: Tracker, folder: Run, key: str, name: str, tags: dict[str, str]) -> Tracker:
+def _continue_or_create(near: Tracker, folder: Run, key: str, name: str) -> Tracker:
     """Return the MLflow run that the folder has stored under `key`, or create and store a new one."""
     from mlflow.exceptions import MlflowException
 
@@ -363,7 +357,7 @@ def _continue_or_create(near: Tracker, folder: Run, key: str, name: str, tags: d
         except MlflowException as error:  # the run was deleted: create a new one
             if error.error_code in UNAVAILABLE:
                 raise
-    run = near.client.create_run(near.experiment_id, now_ms(), tags=tags, run_name=name)
+    run = near.client.create_run(near.experiment_id, now_ms(), tags={"kind": key}, run_name=name)
     undo_if_refused(partial(near.client.delete_run, run.info.run_id))
     write_json(folder.path / KNOWN_RUNS, {**known, slot: run.info.run_id})
     created = dataclasses.replace(near, run_id=run.info.run_id)

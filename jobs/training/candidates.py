@@ -5,7 +5,6 @@ the conditions are drawn, so the choice depends on no corridor and no level of a
 """
 
 import dataclasses
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,7 @@ from jobs.rollout.policies import EvaluatedPolicy, read_policy
 from jobs.rollout.scheduler import default_executor, evaluate_tasks
 from jobs.rollout.store import EpisodeStore
 from jobs.rollout.tasks import EvaluationTask, make_task
-from jobs.run.files import read_json_lines, write_atomic, write_json
+from jobs.run.files import write_atomic, write_json
 from jobs.run.folder import Run
 from models.policy.policy import MANIFEST, read_policy_manifest
 
@@ -111,8 +110,8 @@ def best_of(rates: Mapping[int, tuple[float, float]]) -> int:
     return max(rates, key=lambda seed: (*rates[seed], -seed))
 
 
-def take(folder: Run, best: Run, rates: Mapping[int, tuple[float, float]]) -> list[dict[str, float]]:
-    """Copy a candidate's policy into its run; return the rows of its learning curve.
+def take(folder: Run, best: Run, rates: Mapping[int, tuple[float, float]]) -> None:
+    """Copy a candidate's policy and learning curve into its run.
 
     The manifest has the run's own seed, and the success rates of all candidates.
     """
@@ -128,8 +127,6 @@ def take(folder: Run, best: Run, rates: Mapping[int, tuple[float, float]]) -> li
     write_json(folder.policy / MANIFEST, {**manifest, "seed": folder.config.seed, "candidates": chosen})
     lines = best.train / "results.jsonl"
     write_atomic(folder.train / lines.name, lines.read_bytes())
-    return [{name: math.nan if value is None else value for name, value in row.items()}
-            for row in read_json_lines(lines)]  # fmt: skip
 
 
 def show(rates: Mapping[int, tuple[float, float]], best: int) -> None:

@@ -102,10 +102,11 @@ def check_collect(folder: Run) -> tuple[Path | None, list[dict[str, Recorded]]]:
     Raises:
         ConfigError: `collect.policy` or `collect.recordings` names a file that does not fit.
     """
-    policy, config = check_policy(folder), folder.config
     if finished(folder, "collect") is not None:
         return None, []
-    settings = config.collect
+    config, settings = folder.config, folder.config.collect
+    named = settings.policy
+    policy = None if named is None else load_trained("collect.policy", named, config.env)[0]
     if settings.recordings and knows_truth(config):
         rule = "must be [] for model.target=proximity, which only a simulator knows; take target=occupancy"
         raise ConfigError(f"collect.recordings: {rule}, got {settings.recordings}")
@@ -136,18 +137,6 @@ def check_pictures(config: Config) -> None:
 def learns_to_denoise(config: Config) -> bool:
     """Whether the encoder decodes the events before the sensor's faults; never if it decodes proximity."""
     return config.pretrain.denoise and not knows_truth(config)
-
-
-def check_policy(folder: Run) -> Path | None:
-    """Return the folder of the policy whose episodes a run has yet to record; None if there is none.
-
-    Raises:
-        ConfigError: `collect.policy` names no policy, or one for another sensor.
-    """
-    named = folder.config.collect.policy
-    if named is None or finished(folder, "collect") is not None:
-        return None
-    return load_trained("collect.policy", named, folder.config.env)[0]
 
 
 def record(

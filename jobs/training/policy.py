@@ -53,8 +53,9 @@ def pretrained_encoder(config: Config, path: str | Path | None) -> tuple[str | P
         RunError: The encoder file is damaged.
         ValueError: A policy that needs an encoder got none, or a policy without one got a file.
     """
-    name, needed = config.model.name, KINDS[config.model.name].encoder
-    if policy_spec(config).finetuned and config.train.init is not None:  # in its networks
+    name, spec = config.model.name, policy_spec(config)
+    needed = KINDS[name].encoder
+    if spec.finetuned and config.train.init is not None:  # in its networks
         return None
     if needed != (path is not None):
         raise ValueError(f"encoder_path must be {'a file' if needed else 'None'} for {name}, got {path!r}")
@@ -69,7 +70,6 @@ def pretrained_encoder(config: Config, path: str | Path | None) -> tuple[str | P
     if differ:
         remedy = "use its settings, or pretrain an encoder for these"
         raise ConfigError(f"encoder: was made for another sensor: {differ}; {remedy}")
-    spec = policy_spec(config)
     if spec.finetuned and spec.evae != about["model"]:
         raise ConfigError(f"encoder: must be one of {spec.evae} to be fine-tuned, got {about['model']}")
     return path, about

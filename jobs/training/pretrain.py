@@ -55,7 +55,6 @@ MIN_STEPS, MAX_STEPS = 0.5, 8.0
 VALIDATION_WINDOWS = 200
 PICTURE_WINDOWS = 8
 MANY = 10**9  # events
-SPLITS = ("train", "validation")
 NEVER_US = 1 << 62  # start of the episode after the last one
 COLLAPSED = (
     "the latent says nothing of its window (posterior collapse), a policy would see nothing; "
@@ -137,7 +136,7 @@ def pretrain(folder: Run, tracker: Tracker) -> dict[str, float]:
     config, settings = folder.config, folder.config.pretrain
     check_data(folder)
     (train, true), (validation, validation_true) = (
-        read_split(folder, split, learns_to_denoise(config)) for split in SPLITS
+        read_split(folder, split, learns_to_denoise(config)) for split in ("train", "validation")
     )
     seed, device = (config.seed, 2), config.cluster.device
     training = EvaeTraining(evae_settings(config), train, settings, seed, true, device)

@@ -15,7 +15,6 @@ from jobs.config.schema import RecordingConfig
 from jobs.run.recordings import recording_parts
 
 GAP_US = 1_000_000  # between one recording and the next
-FROM_THE_FILE = RecordingConfig()  # for a file that states everything itself
 
 
 class Recorded(NamedTuple):
@@ -33,7 +32,7 @@ class Recorded(NamedTuple):
 
 
 def read_recorded(
-    path: str | Path, env: EnvConfig, validation_share: float, settings: RecordingConfig = FROM_THE_FILE
+    path: str | Path, env: EnvConfig, validation_share: float, settings: RecordingConfig
 ) -> dict[str, Recorded]:
     """Return an event file as the simulator's camera would have recorded the middle of its picture.
 
@@ -66,9 +65,7 @@ def read_recorded(
     return {split: _part(Path(path).name, fitted.events, span, env) for split, span in spans.items()}
 
 
-def read_whole(
-    path: str | Path, env: EnvConfig, settings: RecordingConfig = FROM_THE_FILE
-) -> tuple[Recorded, "Fitted"]:
+def read_whole(path: str | Path, env: EnvConfig, settings: RecordingConfig) -> tuple[Recorded, "Fitted"]:
     """Return a whole file as one part, read as by `read_recorded`, and the `Fitted` recording.
 
     Raises:

@@ -135,8 +135,9 @@ def train(folder: Run, encoder_path: Path | None, on_result: OnResult) -> Path:
     rates = validate(folder, {seed: own.policy for seed, own in runs.items()})
     best = best_of(rates)
     show(rates, best)
-    for row in take(folder, runs[best], rates):
-        on_result(int(row["env_steps"]), {name: value for name, value in row.items() if name != "env_steps"})
+    take(folder, runs[best], rates)
+    for env_steps, metrics in read_results(folder.train / "results.jsonl"):
+        on_result(env_steps, metrics)
     finish(folder, "train", finished(runs[best], "train") or {})
     return folder.policy
 
@@ -282,7 +283,8 @@ def restored(path: str, trainable: type, built: Any) -> tune.Tuner:
 def _listening(folder: Run, on_result: OnResult) -> Iterator[dict[str, float]]:
     """Record, show and pass on each new result; yield the newest metrics, a dict updated in place."""
     config, file = folder.config, folder.train / "results.jsonl"
-    reported, last = reported_so_far(file)
+    done = read_results(file)
+    reported, last = done[-1] if done else (0, {})
     algorithm, total, since_s = algorithm_of(config), config.train.env_steps, time.monotonic()
     with progress("Train the policy", total, "steps", done=reported) as advance:
 
@@ -313,17 +315,16 @@ def relayed_to(listen: Callable[[Mapping[str, Any]], None]) -> Iterator[None]:
         _listeners.pop()
 
 
-def reported_so_far(file: Path) -> tuple[int, dict[str, float]]:
-    """Return environment steps and metrics of a results file's last complete line; 0 and {} without a line.
+def read_results(file: Path) -> list[tuple[int, dict[str, float]]]:
+    """Return environment steps and metrics of each complete line of a results file; NaN: not measured.
 
     Raises:
         RunError: A line is damaged.
     """
-    rows = read_json_lines(file)
-    if not rows:
-        return 0, {}
-    row = rows[-1]
-    return int(row.pop("env_steps")), {name: math.nan if x is None else x for name, x in row.items()}
+    return [
+        (int(row.pop("env_steps")), {name: math.nan if x is None else x for name, x in row.items()})
+        for row in read_json_lines(file)
+    ]
 
 
 def read_metrics(result: Mapping[str, object], seconds: float, algorithm: Algorithm) -> dict[str, float]:

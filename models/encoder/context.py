@@ -30,7 +30,7 @@ torch computes the last layer and the maximum (`max_on_device`).
 
 import itertools
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numba
 import numpy as np
@@ -40,7 +40,7 @@ from torch.nn import functional
 
 from models.encoder.embedding import embedding_table, eventnet_phase
 from models.encoder.event_batch import EventBatch, Grid, distinct
-from models.encoder.gpu_context import max_context
+from models.encoder.gpu_context import Events, max_on_device
 from models.encoder.products import Linear, affine, product
 
 DTYPES = (torch.float32, torch.float64)
@@ -229,15 +229,6 @@ def folded(
     return h, layer.weight * (norm.weight * torch.rsqrt(variance + norm.eps))[:, None], norm.bias
 
 
-class Events(NamedTuple):
-    """Cell and time bin of each event, `offsets` as in `EventBatch`, and the code of each time bin."""
-
-    cell: np.ndarray
-    bin: np.ndarray
-    offsets: np.ndarray
-    codes: np.ndarray
-
-
 def newest_first(events: Events) -> Events:
     """Sort each window's events by descending time bin, so that the newest wins a tie."""
     window = np.repeat(np.arange(len(events.offsets) - 1), np.diff(events.offsets))
@@ -248,15 +239,6 @@ def newest_first(events: Events) -> Events:
 def _largest(values: Tensor, rank: int) -> Tensor:
     """Return the rank-th largest value (D,) of each column of values (N, D) >= 0; 0 if N < rank."""
     return values.topk(rank, 0).values[-1] if len(values) >= rank else values[:0].sum(0)
-
-
-def max_on_device(
-    h: Tensor, weight: Tensor, bias: Tensor, events: Events, squash: bool, rank: int
-) -> tuple[Tensor, Tensor]:
-    """Compute `MaxContext` with torch operations, on the device of the inputs."""
-    features = torch.relu(affine(h, weight, bias))
-    features = torch.tanh(features) if squash else features
-    return max_context(features, events.codes, (events.cell, events.bin), events.offsets, rank)
 
 
 class MaxContext(torch.autograd.Function):

@@ -49,7 +49,7 @@ def temporal_embedding(t: npt.ArrayLike, context: int) -> np.ndarray:
     return np.concatenate([np.sin(phase), np.cos(phase)], axis=-1)
 
 
-def time_code(t: npt.ArrayLike, context: int, coding: str = "additive") -> np.ndarray:
+def time_code(t: npt.ArrayLike, context: int, coding: str) -> np.ndarray:
     """Return the codes that are added to the features of events at normalised times: float64 (..., context).
 
     Raises:
@@ -86,7 +86,7 @@ def embedding_table(
 
 
 @functools.lru_cache(maxsize=4)
-def eventnet_phase(time_bins: int, dtype: str = "float32") -> np.ndarray:
+def eventnet_phase(time_bins: int, dtype: str) -> np.ndarray:
     """Return real and imaginary part of exp(-i 2 pi age) of each bin, read-only `dtype` (2, time_bins).
 
     Source: paper equation 4 (appendix A.2), from EventNet (Sekikawa et al. 2019).

@@ -16,7 +16,7 @@ iterations. A weight near 1e-5 avoids this collapse.
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import torch
@@ -38,6 +38,11 @@ ACTIVE_VARIANCE = 0.01  # a latent unit is active if its mean varies more over w
 # Measured: a collapsed latent held 0.03 nats and explained 0.000; working latents hold 10 nats or more.
 EMPTY_KL = 0.1  # nats
 EMPTY_EXPLAINED = 0.01
+# Error of a target's values; the other targets have a cross entropy.
+ERRORS: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
+    "signed": functional.smooth_l1_loss,
+    "counts": functional.mse_loss,
+}
 
 
 class EventVAE(nn.Module):
@@ -163,10 +168,8 @@ def reconstruction_loss(logits: Tensor, targets: Tensor, target: str) -> Tensor:
 
     The cross entropy takes logits because sigmoid followed by log is infinite for logits from 17 on.
     """
-    if target == "signed":
-        return functional.smooth_l1_loss(torch.tanh(logits), targets)
-    if target == "counts":
-        return functional.mse_loss(logits, targets)
+    if target in ERRORS:
+        return ERRORS[target](reconstruct(logits, target), targets)
     return functional.binary_cross_entropy_with_logits(logits, targets)
 
 
@@ -261,16 +264,9 @@ def validate(evae: EventVAE, batch: EventBatch, targets: Tensor) -> dict[str, fl
         than 0, are the positives), kl (mean over windows [nats]), active_units.
     """
     logits, mu, logvar = evae(batch)
-    mean = targets.mean(0).expand_as(targets)
-    if evae.target == "signed":
-        baseline = functional.smooth_l1_loss(mean, targets)
-    elif evae.target == "counts":
-        baseline = functional.mse_loss(mean, targets)
-    else:
-        baseline = functional.binary_cross_entropy(mean, targets)
-    reconstruction, mean_picture = (
-        error.item() for error in (reconstruction_loss(logits, targets, evae.target), baseline)
-    )
+    error = ERRORS.get(evae.target, functional.binary_cross_entropy)
+    reconstruction = reconstruction_loss(logits, targets, evae.target).item()
+    mean_picture = error(targets.mean(0).expand_as(targets), targets).item()
     return {
         "reconstruction": reconstruction,
         "mean_picture": mean_picture,

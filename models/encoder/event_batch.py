@@ -58,7 +58,7 @@ class EventBatch:
         for name, values, limit in limits:
             if values.dtype != np.int32 or values.shape != self.code.shape:
                 raise ValueError(f"{name} must be int32, one per event, got {values.dtype} {values.shape}")
-            if not _within(values, limit):
+            if len(values) and not 0 <= values.min() <= values.max() < limit:
                 raise ValueError(f"{name} must lie in 0..{limit - 1}, got {values.min()}..{values.max()}")
         ends = self.offsets
         if ends.dtype != np.int64 or len(ends) < 1 or ends[0] != 0 or ends[-1] != len(self.code):
@@ -96,20 +96,6 @@ class EventBatch:
     def on(self) -> np.ndarray:
         """Return which events are ON, bool (N,)."""
         return self.code >= self.grid.width * self.grid.height
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _within(values: np.ndarray, limit: int) -> bool:
-    """Whether all values lie in 0 .. limit - 1."""
-    outside = False
-    for value in values:
-        outside |= value < 0 or value >= limit
-    return not outside
-
-
-def address_events(events: Any, start_us: int, window_us: int, grid: Grid) -> np.ndarray:
-    """Run `index_events` on events with named fields t, x, y, p."""
-    return index_events(tuple(events[name] for name in "txyp"), start_us, window_us, grid)
 
 
 def index_events(fields: tuple[np.ndarray, ...], start_us: int, window_us: int, grid: Grid) -> np.ndarray:
@@ -156,12 +142,17 @@ def _index(t, x, y, p, span, grid, address) -> int:  # type: ignore[no-untyped-d
 
 
 def batch_windows(windows: Iterable[tuple[Any, int, int]], grid: Grid) -> EventBatch:
-    """Batch windows given as (events, start_us, window_us); events as in `address_events`.
+    """Batch windows given as (events, start_us, window_us); events have the fields t, x, y, p by name.
 
     Raises:
         ValueError: As in `index_events`.
     """
-    return _join([address_events(*window, grid) for window in windows], grid)
+    parts = [
+        index_events(tuple(events[name] for name in "txyp"), start_us, window_us, grid)
+        for events, start_us, window_us in windows
+    ]
+    address = parts[0] if len(parts) == 1 else np.concatenate([np.empty((2, 0), np.int32), *parts], axis=1)
+    return EventBatch.known(grid, address, _sums([part.shape[1] for part in parts]))
 
 
 def batch_packed(windows: np.ndarray | Sequence[np.ndarray], grid: Grid) -> EventBatch:
@@ -319,12 +310,6 @@ def distinct(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     rank = np.empty(len(multiplicity), np.int32)
     rank[present] = np.arange(len(present), dtype=np.int32)
     return present, multiplicity[present], rank[values]
-
-
-def _join(parts: list[np.ndarray], grid: Grid) -> EventBatch:
-    offsets = _sums([part.shape[1] for part in parts])
-    address = parts[0] if len(parts) == 1 else np.concatenate([np.empty((2, 0), np.int32), *parts], axis=1)
-    return EventBatch.known(grid, address, offsets)
 
 
 def _sums(sizes: list[int]) -> np.ndarray:

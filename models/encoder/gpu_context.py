@@ -4,33 +4,37 @@ All sums of a feature and a code are computed at once (4 N D bytes) and searched
 gradient then flows to the winners alone. Sums and maxima are rounded as on a CPU.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 from torch import Tensor
 
+from models.encoder.products import affine
 
-def max_context(
-    features: Tensor,
-    codes: np.ndarray,
-    address: tuple[np.ndarray, np.ndarray],
-    offsets: np.ndarray,
-    rank: int = 1,
+
+class Events(NamedTuple):
+    """Cell and time bin of each event, `offsets` as in `EventBatch`, and the code of each time bin."""
+
+    cell: np.ndarray
+    bin: np.ndarray
+    offsets: np.ndarray
+    codes: np.ndarray
+
+
+def max_on_device(
+    h: Tensor, weight: Tensor, bias: Tensor, events: Events, squash: bool, rank: int
 ) -> tuple[Tensor, Tensor]:
-    """Return the rank-th largest over a window's events of ReLU(features[cell] + codes[bin]).
-
-    Args:
-        features: Features of each cell (U, D), >= 0, on any device.
-        codes: Code of each time bin (T, D), in the precision of the features.
-        address: Cell and time bin of each event, integers (N,) each.
-        offsets: Window b holds events offsets[b] .. offsets[b + 1] - 1, int64 (B + 1,).
-        rank: 1 for the largest; a window with fewer events has the context 0.
+    """Compute `models.encoder.context.MaxContext` with torch operations, on the device of the inputs.
 
     Returns:
         Contexts (B, D) with a gradient, and the time bin int64 (B, D) of the event behind each value, 0 if
         there is none. Equal values rank in the order of their events.
     """
-    cell, bins = (torch.from_numpy(part).to(features.device, torch.int64) for part in address)
-    code = torch.tensor(codes, device=features.device)
+    features = torch.relu(affine(h, weight, bias))
+    features = torch.tanh(features) if squash else features
+    cell, bins = (torch.from_numpy(part).to(h.device, torch.int64) for part in (events.cell, events.bin))
+    code, offsets = torch.tensor(events.codes, device=h.device), events.offsets
     best = features.new_zeros((len(offsets) - 1, features.shape[1]))
     winner = torch.zeros_like(best, dtype=torch.int64)
     if len(cell) == 0:

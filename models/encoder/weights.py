@@ -74,7 +74,7 @@ def save_encoder(
     if taken:
         raise EncoderFileError(f"{target}: the manifest's keys {taken} are written here; rename yours")
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in evae.state_dict().items()}
-    check_tensors(target, tensors, evae.settings)
+    check_tensors(target, tensors, expected_tensors(evae.settings))
     data = safetensors.torch.save(lean_tensors(tensors) if lean else tensors)
     digest = hashlib.sha256(data).hexdigest()
     model = dataclasses.asdict(evae.settings)
@@ -113,7 +113,7 @@ def load_encoder(path: str | Path) -> tuple[EventVAE, EncoderManifest]:
         tensors = safetensors.torch.load(data)
     except Exception as error:
         raise EncoderFileError(f"{target}: not a safetensors file: {error}") from None
-    check_tensors(target, tensors, settings)
+    check_tensors(target, tensors, expected)
     evae = EventVAE.of(settings)
     if is_lean(tensors):
         evae.decoder = None
@@ -187,13 +187,12 @@ def expected_tensors(settings: EvaeSettings) -> dict[str, Tensor]:
         return EventVAE.of(settings).state_dict()
 
 
-def check_tensors(path: Path, tensors: dict[str, Tensor], settings: EvaeSettings) -> None:
-    """Check tensors against the model they belong to.
+def check_tensors(path: Path, tensors: dict[str, Tensor], expected: dict[str, Tensor]) -> None:
+    """Check tensors against the `expected_tensors` of the model that they belong to.
 
     Raises:
         EncoderFileError: A name, shape or dtype differs, a value is not finite, or a variance is negative.
     """
-    expected = expected_tensors(settings)
     if is_lean(tensors):
         expected = {name: model for name, model in expected.items() if not name.startswith(DECODER)}
     if set(tensors) != set(expected):

@@ -24,11 +24,6 @@ class EventFilter:
     tau_us: int
     last_us: np.ndarray
 
-    @classmethod
-    def begin(cls, support: int, tau_us: int, width: int, height: int) -> "EventFilter":
-        """Return the filter at the start of an episode, for a sensor of width x height pixels."""
-        return cls(support, tau_us, quiet_sensor(width, height))
-
     def __call__(self, events: Any) -> dict[str, np.ndarray]:
         """Return the events that pass, in their order.
 
@@ -52,7 +47,8 @@ class EventFilter:
 
 
 def filter_of(sensor: Mapping[str, Any], width: int, height: int) -> EventFilter | None:
-    """Return the filter that a manifest's sensor settings define; None if they define none."""
+    """Return the filter of a manifest's sensor settings at an episode's start; None if they define none."""
     if not sensor.get("filter_support"):
         return None
-    return EventFilter.begin(int(sensor["filter_support"]), int(sensor["filter_tau_us"]), width, height)
+    last_us = quiet_sensor(width, height)
+    return EventFilter(int(sensor["filter_support"]), int(sensor["filter_tau_us"]), last_us)

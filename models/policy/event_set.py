@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from models.encoder.event_batch import ROW_EMPTY, ROW_OFF, ROW_ON, EventBatch, Grid, batch_rows, distinct
+from models.encoder.event_batch import ROW_EMPTY, ROW_OFF, ROW_ON, Grid, batch_rows, distinct
 from models.encoder.products import Linear
 from models.encoder.table import dense
 
@@ -54,7 +54,10 @@ class EventSet(nn.Module):
         if stacks.device.type != "cpu":
             return self.plain(stacks)
         batch = batch_rows(stacks.flatten(0, 1).numpy(), self.grid)
-        largest, total = self._pooled(batch)
+        cells, _, cell = distinct(batch.code)
+        times, _, time = distinct(batch.bin)
+        events = Events(cell, time, batch.offsets)
+        largest, total = GatedPool.apply(*self.factors(cells, times), events)
         number = torch.from_numpy(np.diff(batch.offsets)).to(total)[:, None]
         return self._joined((largest, total, number), stacks.shape[:2])
 
@@ -67,12 +70,6 @@ class EventSet(nn.Module):
         features = self.place(inputs) * self.gate(time / TIMES) * there
         pooled = features.amax(-2), features.sum(-2), there.sum(-2)
         return self._joined(pooled, stacks.shape[:2])
-
-    def _pooled(self, batch: EventBatch) -> tuple[Tensor, Tensor]:
-        """Return maximum and sum (windows, WIDTH) over the events of each window."""
-        cells, _, cell = distinct(batch.code)
-        times, _, time = distinct(batch.bin)
-        return GatedPool.apply(*self.factors(cells, times), Events(cell, time, batch.offsets))
 
     def factors(self, cells: np.ndarray, times: np.ndarray) -> tuple[Tensor, Tensor]:
         """Return the two factors whose product is the features of an event.

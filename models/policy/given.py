@@ -109,8 +109,8 @@ def _array(values: Any) -> np.ndarray:
 
 def _columns(rows: np.ndarray) -> list[np.ndarray]:
     """Return the four columns of event rows (N, 4)."""
-    if rows.size == 0 and rows.shape in ((0,), (0, 4)):
+    if rows.shape == (0,):
         return [np.empty(0, np.int64)] * 4
-    if rows.dtype.names or rows.ndim != 2 or rows.shape[1] != len(NAMES):
+    if rows.ndim != 2 or rows.shape[1] != len(NAMES):
         raise ValueError(f"{RULE}; got {rows.dtype} of shape {rows.shape}")
     return list(rows.T)

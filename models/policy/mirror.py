@@ -32,16 +32,11 @@ def mirror(observations: Any, spec: PolicySpec) -> Any:
 
 
 def _mirror_windows(windows: Any, width: int) -> Any:
-    mirrored = tuple([_mirror_window(window, width) for window in windows])
+    mirrored = tuple([window.copy() for window in windows])
+    for window in mirrored:
+        events = window[1 : 1 + int(window[0, 0])]
+        events[:, 1] = width - 1 - events[:, 1]
     return np.stack(mirrored) if isinstance(windows, np.ndarray) else mirrored
-
-
-def _mirror_window(window: np.ndarray, width: int) -> np.ndarray:
-    """Return a packed window with left and right exchanged."""
-    mirrored = window.copy()
-    events = mirrored[1 : 1 + int(window[0, 0])]
-    events[:, 1] = width - 1 - events[:, 1]
-    return mirrored
 
 
 def _mirror_pictures(pictures: np.ndarray, width: int) -> np.ndarray:

@@ -74,31 +74,29 @@ def export_onnx(policy: Policy, path: str | Path) -> Path:
     if missing:
         raise ModuleNotFoundError(f"ONNX export needs {', '.join(missing)}: pip install 'evade[onnx]'")
     graph = PolicyGraph(policy).eval()
-    seen, examples, dynamic = graph.examples()
-    stack = torch.zeros(graph.shape, dtype=graph.dtype)
-    names = {"input_names": [*seen, "last_stack", "first"], "output_names": ["logits", "next_stack"]}
-    inputs = [*examples, stack, torch.tensor(True)]
+    inputs = graph.examples()
+    own: dict[str, Tensor] = {}
+    inputs |= {"last_stack": torch.zeros(graph.shape, dtype=graph.dtype), "first": torch.tensor(True)}
     if graph.own_velocity:
-        names["input_names"].append("velocity_mps")
-        inputs.append(torch.zeros(2))
-    own = []
+        inputs["velocity_mps"] = torch.zeros(2)
     if graph.own_actions:
-        own.append(("action", torch.tensor(0)))
+        own["action"] = torch.tensor(0)
     if graph.state_size:
-        own.append(("state", torch.zeros(graph.state_size)))
+        own["state"] = torch.zeros(graph.state_size)
     if graph.filter is not None:
-        own.append(("us", torch.from_numpy(graph.filter.last_us.copy())))
-    inputs += [value for _, value in own]
-    names["input_names"] += [f"last_{name}" for name, _ in own]
-    names["output_names"] += [*(f"next_{name}" for name, _ in own), "dropped"]
-    names["output_names"] += [] if graph.commands is None else ["command"]
+        own["us"] = torch.from_numpy(graph.filter.last_us.copy())
+    inputs |= {f"last_{name}": value for name, value in own.items()}
+    outputs = ["logits", "next_stack", *(f"next_{name}" for name in own), "dropped"]
+    outputs += [] if graph.commands is None else ["command"]
+    count = torch.export.Dim("count", min=0, max=MAX_EVENTS)
     program: Any = torch.onnx.export(
         graph,
-        tuple(inputs),
+        tuple(inputs.values()),
+        input_names=list(inputs),
+        output_names=outputs,
         dynamo=True,
-        dynamic_shapes=((*dynamic, *(None for _ in inputs[len(examples) :])),),  # of the one argument *inputs
+        dynamic_shapes=(tuple({0: count} if name == "events" else None for name in inputs),),  # of *inputs
         verbose=False,
-        **names,
     )
     program.save(str(path))
     return Path(path)
@@ -139,13 +137,12 @@ class PolicyGraph(nn.Module):
             for name, array in arrays.items():
                 self.register_buffer(name, torch.from_numpy(array.copy()))
 
-    def examples(self) -> tuple[list[str], tuple[Tensor, ...], tuple[object, ...]]:
-        """Return names, examples and dynamic shapes of the inputs that the policy observes."""
+    def examples(self) -> dict[str, Tensor]:
+        """Return an example of each input that the policy observes, by its name."""
         if self.sees_events:
             events = torch.tensor([[0, 0, 0, 1], [1, 0, 0, -1], [2, 0, 0, 1]])
-            count = torch.export.Dim("count", min=0, max=MAX_EVENTS)
-            return ["events", "window_us"], (events, torch.tensor(5000)), ({0: count}, None)
-        return ["luminance"], (torch.zeros(self.size),), (None,)
+            return {"events": events, "window_us": torch.tensor(5000)}
+        return {"luminance": torch.zeros(self.size)}
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """Compute the outputs from the inputs; the module's docstring lists both."""

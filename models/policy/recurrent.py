@@ -38,18 +38,14 @@ class GatedUnit(nn.Module):
         Returns:
             States after each step (B, T, units), and after the last (B, units).
         """
-        given, states = self.inward(stacks.flatten(2)), []
-        for step in given.unbind(1):
-            state = self.after(step, state)
+        states = []
+        for given in self.inward(stacks.flatten(2)).unbind(1):
+            reset, update, new = given.split(self.units, 1)
+            own_reset, own_update, own_new = self.inner(state).split(self.units, 1)
+            news = torch.tanh(new + torch.sigmoid(reset + own_reset) * own_new)
+            state = news + torch.sigmoid(update + own_update) * (state - news)
             states.append(state)
         return torch.stack(states, 1), state
-
-    def after(self, given: Tensor, state: Tensor) -> Tensor:
-        """Return the state (B, units) after one step, from its weighted inputs (B, 3 units)."""
-        reset, update, new = given.split(self.units, 1)
-        own_reset, own_update, own_new = self.inner(state).split(self.units, 1)
-        news = torch.tanh(new + torch.sigmoid(reset + own_reset) * own_new)
-        return news + torch.sigmoid(update + own_update) * (state - news)
 
 
 def gru(shape: Sequence[int], spec: PolicySpec) -> tuple[nn.Module, ...]:

@@ -88,7 +88,7 @@ def test_sensors_side_by_side_are_filtered_as_each_by_itself(one, two, support):
 @settings(max_examples=30)
 @given(streams, supports)
 def test_a_policy_that_is_shown_raw_events_filters_as_the_environment(stream, support):
-    events, own = make_stream(*stream), EventFilter.begin(support, TAU_US, WIDTH, HEIGHT)
+    events, own = make_stream(*stream), EventFilter(support, TAU_US, quiet_sensor(WIDTH, HEIGHT))
     half = events.size // 2
     kept = [own(part) for part in (events[:half], events[half:])]
     expected = passing(events, support)
@@ -100,4 +100,4 @@ def test_an_event_outside_the_sensor_is_refused():
     events = make_stream(0, 5)
     events["x"][3] = WIDTH
     with pytest.raises(ValueError, match=f"within {WIDTH} x {HEIGHT} pixels; event 3 is at x={WIDTH}"):
-        EventFilter.begin(1, TAU_US, WIDTH, HEIGHT)(events)
+        EventFilter(1, TAU_US, quiet_sensor(WIDTH, HEIGHT))(events)

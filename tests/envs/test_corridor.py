@@ -22,7 +22,8 @@ def move(poles, start, planned, radius_m):
     """One control step of a vehicle at a height of 2 m among poles (x, y, radius)."""
     obstacles = np.array([(POLE, x, y, 3.0, r, r, 3.0, 0.5) for x, y, r in poles], OBSTACLE)
     scene = Scene("test", obstacles)
-    return advance(Lane(radius_m, 15.0, scene.length_m), scene.sections(2.0), start, planned)
+    bodies, lane = (scene.sections(2.0), np.zeros((0, 9))), Lane(radius_m, 15.0, scene.length_m)
+    return advance(lane, bodies, (0.0, 1.0), start, planned)
 
 
 def straight(env, seed=0):

@@ -13,7 +13,7 @@ from envs.sensor import Sensor, check_sensed, sense_way
 def step_sensor(config: EnvConfig, sensor: Sensor, start: Point, outcome: Outcome, end_us: int) -> None:
     """Step any sensor, as a vehicle does that flies from `start` to `outcome.end`."""
     if not sensor.sees_by_looks:
-        sensor.step(start, outcome, end_us)
+        sensor.step(start, outcome.end, outcome.share, end_us, None)
         return
     begin_us, view = sensor.t_us, sensor.view()
     moving_us = round(outcome.share * (end_us - begin_us))

@@ -7,8 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from jobs.config.registry import Job
-
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -44,6 +42,6 @@ def job(launcher, monkeypatch):
         module = types.ModuleType("jobs_under_test")
         module.run = function
         monkeypatch.setitem(sys.modules, "jobs_under_test", module)
-        monkeypatch.setitem(launcher.JOBS, "train", Job("jobs_under_test"))
+        monkeypatch.setitem(launcher.JOBS, "train", launcher.JOBS["train"]._replace(module="jobs_under_test"))
 
     return replace

@@ -41,10 +41,10 @@ def test_answers_come_without_anything_heavy_and_alike_from_the_command_in_any_f
 def test_a_job_begins_before_anything_heavy_is_imported_and_a_terminal_of_ascii_shows_question_marks():
     code = """
 import sys, types, jobs
-from jobs.config.registry import JOBS, Job
+from jobs.config.registry import JOBS
 from jobs.run.progress import console
 sys.modules["stub"] = types.SimpleNamespace(run=lambda config: (console.print("a · b"), print(*sys.modules)))
-JOBS["train"] = Job("stub")
+JOBS["train"] = JOBS["train"]._replace(module="stub")
 sys.argv = ["evade", "+exp=train"]
 sys.exit(jobs.main())
 """

@@ -8,7 +8,6 @@ stopped search, run the same command again.
 """
 
 import dataclasses
-import re
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -126,22 +125,17 @@ class Earlier(NamedTuple):
     rows: Sequence[Row] = ()
 
 
-NOTHING_YET = Earlier()
-
-
 def earlier_trials(folder: Run, own: Settings) -> Earlier:
-    """Return the largest finished search with fewer trials and otherwise equal settings."""
+    """Return the largest finished search with fewer trials and otherwise equal settings, or none."""
     for trials in range(own.trials - 1, 0, -1):
         name = place_name(dataclasses.replace(own, trials=trials))
         file = folder.path / name / "results.jsonl"
         if finished(folder, name) is not None and file.is_file():
             return Earlier(trials, read_json_lines(file))
-    return NOTHING_YET
+    return Earlier()
 
 
-def search(
-    config: Config, place: Path, files: Files, tracker: Tracker, begun: Earlier = NOTHING_YET
-) -> list[Row]:
+def search(config: Config, place: Path, files: Files, tracker: Tracker, begun: Earlier) -> list[Row]:
     """Run the missing trials; return all measurements of all trials, in order of arrival."""
     start_ray(config.cluster, place.parent)
     place.mkdir(exist_ok=True)
@@ -249,7 +243,7 @@ def words(settings: Mapping[str, Any]) -> str:
     texts = {
         key: f"{value:.4g}" if isinstance(value, float) else str(value) for key, value in settings.items()
     }
-    return " ".join(shlex.quote(f"{key}={re.sub(r' ', '', text)}") for key, text in texts.items())
+    return " ".join(shlex.quote(f"{key}={text.replace(' ', '')}") for key, text in texts.items())
 
 
 def report(folder: Run, name: str, rows: Sequence[Row], tracker: Tracker) -> Row:

@@ -9,8 +9,7 @@ from ray.rllib.core.columns import Columns
 from torch import Tensor
 
 from envs.kinematics import MIRRORED_ACTIONS
-from jobs.training.ppo.losses import STARTS, TAKEN
-from jobs.training.sampling.env_runner import STATES
+from jobs.training.ppo.losses import TAKEN
 
 SETTINGS = "imitation"  # key among the learner's settings: the fields of `ImitationConfig`, and env_steps
 COSTS = "costs"  # column of a step: cost of each action minus the lowest cost, float32 (actions,)
@@ -22,32 +21,6 @@ def mirror_images(settings: Mapping[str, Any]) -> list[int]:
     """Return the mirror image of each action, from the learner's settings; empty without mirroring."""
     mirrored = settings.get(MIRRORED, False)  # True for the kinematic vehicle, a list for another
     return MIRRORED_ACTIONS if mirrored is True else list(mirrored or [])
-
-
-def windows(rows: Mapping[str, Tensor], before: int, most: int) -> dict[str, Tensor]:
-    """Cut rows of successive steps into windows that a recurrent network reads from a zero state.
-
-    A window has up to `before` warm-up steps, which only build up the state, then up to `most` steps to learn
-    from. A window with fewer warm-up steps is dropped, unless its piece is the start of an episode.
-
-    Args:
-        rows: Columns (N, ...), among them `STARTS`, and `STATES`, the state before each step.
-        before: Most warm-up steps of a window.
-        most: Most steps to learn from in a window.
-
-    Returns:
-        Columns (C, before + most, ...) without `STATES`, and `TAKEN`, True for the steps to learn from.
-    """
-    steps, states = rows[STARTS], rows[STATES]
-    first = torch.nonzero(steps % most == 0)[:, 0]
-    ends = torch.cat([first[1:], torch.tensor([len(steps)])])
-    piece = first - steps[first]
-    known = ~states[piece].any(1) | (steps[first] >= before)  # zero only at an episode's start
-    first, ends, piece = first[known], ends[known], piece[known]
-    places = torch.maximum(first - before, piece)[:, None] + torch.arange(before + most)
-    taken = (places >= first[:, None]) & (places < ends[:, None])
-    places = torch.minimum(places, ends[:, None] - 1)
-    return {name: column[places] for name, column in rows.items() if name != STATES} | {TAKEN: taken}
 
 
 class LabelledSteps:

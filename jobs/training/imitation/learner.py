@@ -8,7 +8,7 @@ corridors from the start (Ash and Adams 2020). The value network is not trained.
 
 With mirroring, each step is stored a second time with left and right exchanged, observation and label.
 
-A recurrent network learns from windows of steps (`labelled_steps.windows`). Each starts from a zero state,
+A recurrent network learns from windows of steps (`ppo.losses.windows`). Each starts from a zero state,
 not from the state in which the env runner acted: that state came from weights that are later replaced.
 """
 
@@ -26,16 +26,9 @@ from ray.rllib.utils.metrics import NUM_ENV_STEPS_SAMPLED_LIFETIME
 from torch import Tensor
 from torch.nn.functional import cross_entropy
 
-from jobs.training.imitation.labelled_steps import (
-    COSTS,
-    MIRRORED,
-    SETTINGS,
-    LabelledSteps,
-    mirror_images,
-    windows,
-)
+from jobs.training.imitation.labelled_steps import COSTS, MIRRORED, SETTINGS, LabelledSteps, mirror_images
 from jobs.training.ppo.learner import PlainPPOLearner, shared_threads
-from jobs.training.ppo.losses import STARTS, TAKEN
+from jobs.training.ppo.losses import STARTS, TAKEN, windows
 from jobs.training.sampling.env_runner import STATES
 from models.policy.rllib_module import SEQUENCE, STATE
 

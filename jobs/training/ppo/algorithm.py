@@ -16,7 +16,6 @@ from ray.rllib.utils.metrics import (
 )
 
 from jobs.run.files import RunError
-from jobs.training.sampling.env_runner import Part
 from jobs.training.sampling.rounds import Rounds
 from jobs.training.sampling.snapshots import (
     Snapshot,
@@ -87,17 +86,16 @@ class PPO(Guarded, RLlibPPO):
     def training_step(self) -> None:
         """Sample whole rounds with every env runner, update the weights, and send them to the env runners."""
         with self.metrics.log_time((TIMERS, ENV_RUNNER_SAMPLING_TIMER)):
-            parts: list[Part] = []
-            while (
-                sum(len(episode) for part in parts for episode in part.episodes)
-                < self.config.total_train_batch_size
-            ):
-                parts += self._rounds.take()
-            self.metrics.aggregate([part.metrics for part in parts], key=ENV_RUNNER_RESULTS)
+            episodes, metrics = list[Any](), list[Any]()
+            while sum(map(len, episodes)) < self.config.total_train_batch_size:
+                for part in self._rounds.take():
+                    episodes += part.episodes
+                    metrics.append(part.metrics)
+            self.metrics.aggregate(metrics, key=ENV_RUNNER_RESULTS)
         sampled = self.metrics.peek((ENV_RUNNER_RESULTS, NUM_ENV_STEPS_SAMPLED_LIFETIME))
         with self.metrics.log_time((TIMERS, LEARNER_UPDATE_TIMER)):
             learned = self.learner_group.update(
-                episodes=[episode for part in parts for episode in part.episodes],
+                episodes=episodes,
                 timesteps={NUM_ENV_STEPS_SAMPLED_LIFETIME: sampled},
                 num_epochs=self.config.num_epochs,
                 minibatch_size=self.config.minibatch_size,

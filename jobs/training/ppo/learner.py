@@ -122,8 +122,6 @@ class PlainPPOLearner(PPOTorchLearner):
         counters = dict(timesteps or {})
         self.before_gradient_based_update(timesteps=counters)
         training_data = training_data or TrainingData(episodes=episodes)
-        training_data.validate()
-        training_data.solve_refs()
         self._weights_seq_no += 1
         before = counters.get(NUM_ENV_STEPS_SAMPLED_LIFETIME, 0) - sum(map(len, training_data.episodes))
         self._warming_up = before < self.config.learner_config_dict.get(VALUE_WARMUP, -math.inf)
@@ -297,10 +295,7 @@ class PlainPPOLearner(PPOTorchLearner):
         size = len(parts[FIRST_ROW]) if everything else max(1, minibatch_size // SEQUENCE)
         for order in orders:
             # Sort the sequences by the place of their first row in the order of rows.
-            first = parts[FIRST_ROW]
-            ranks = torch.empty_like(order)
-            ranks[order] = torch.arange(len(order))
-            shuffled = ranks[first].argsort().split(size)
+            shuffled = order.argsort()[parts[FIRST_ROW]].argsort().split(size)
             figures = [self._step(_minibatch(parts, picked)) for picked in shuffled]
         return {name: torch.stack([one[name] for one in figures]).mean() for name in FIGURES}
 

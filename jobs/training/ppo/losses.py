@@ -1,8 +1,12 @@
 """Advantages and shaped rewards of episodes, and the sequences that a recurrent network learns from."""
 
+from collections.abc import Mapping
+
 import numpy as np
 import torch
 from torch import Tensor
+
+from jobs.training.sampling.env_runner import STATES
 
 STARTS = "step_of_piece"  # column: number of a step in its piece of an episode, int64
 FIRST_ROW = "first_row"  # of sequences (C, L, ...): row of each sequence's first step, int64 (C,)
@@ -48,21 +52,41 @@ def sequences(rows: dict[str, Tensor], most: int) -> dict[str, Tensor]:
     """Cut rows of successive steps into sequences of at most `most` steps of one piece of an episode.
 
     Args:
-        rows: Columns (N, ...), among them `STARTS`.
+        rows: Columns (N, ...), among them `STARTS` and `STATES`.
         most: Most steps of a sequence.
 
     Returns:
-        Columns (C, most, ...), `FIRST_ROW` and `TAKEN`; of "recurrent_state" only the state before each
+        Columns (C, most, ...), `FIRST_ROW` and `TAKEN`; of `STATES` only the state before each
         sequence's first step, (C, S).
     """
-    steps = rows[STARTS]
+    first = torch.nonzero(rows[STARTS] % most == 0)[:, 0]
+    return {**windows(rows, 0, most), STATES: rows[STATES][first], FIRST_ROW: first}
+
+
+def windows(rows: Mapping[str, Tensor], before: int, most: int) -> dict[str, Tensor]:
+    """Cut rows of successive steps into windows that a recurrent network reads from a zero state.
+
+    A window has up to `before` warm-up steps, which only build up the state, then up to `most` steps to learn
+    from. A window with fewer warm-up steps is dropped, unless its piece is the start of an episode.
+
+    Args:
+        rows: Columns (N, ...), among them `STARTS`, and `STATES`, the state before each step.
+        before: Most warm-up steps of a window.
+        most: Most steps to learn from in a window.
+
+    Returns:
+        Columns (C, before + most, ...) without `STATES`, and `TAKEN`, True for the steps to learn from.
+    """
+    steps, states = rows[STARTS], rows[STATES]
     first = torch.nonzero(steps % most == 0)[:, 0]
     ends = torch.cat([first[1:], torch.tensor([len(steps)])])
-    places = first[:, None] + torch.arange(most)
-    taken = places < ends[:, None]
+    piece = first - steps[first]
+    known = ~states[piece].any(1) | (steps[first] >= before)  # zero only at an episode's start
+    first, ends, piece = first[known], ends[known], piece[known]
+    places = torch.maximum(first - before, piece)[:, None] + torch.arange(before + most)
+    taken = (places >= first[:, None]) & (places < ends[:, None])
     places = torch.minimum(places, ends[:, None] - 1)
-    parts = {name: column[places] for name, column in rows.items() if name != "recurrent_state"}
-    return {**parts, "recurrent_state": rows["recurrent_state"][first], FIRST_ROW: first, TAKEN: taken}
+    return {name: column[places] for name, column in rows.items() if name != STATES} | {TAKEN: taken}
 
 
 def mean_over(taken: Tensor | None, values: Tensor) -> Tensor:

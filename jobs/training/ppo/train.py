@@ -73,9 +73,7 @@ def build(config: Config, encoder_path: str | Path | None = None, init: Path | N
     return build_of(parts, config, encoder_path, init)
 
 
-def build_of(
-    parts: Parts, config: Config, encoder_path: str | Path | None = None, init: Path | None = None
-) -> PPOConfig:
+def build_of(parts: Parts, config: Config, encoder_path: str | Path | None, init: Path | None) -> PPOConfig:
     """Return RLlib's configuration of an algorithm with these parts; other arguments as in `build`."""
     algo = cast(AlgoConfig, config.algo)
     # The learner works while the env runners, if any, wait: one core per env runner is enough for all.

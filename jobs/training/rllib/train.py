@@ -39,7 +39,7 @@ def build(config: Config, encoder_path: str | Path | None = None, init: Path | N
         "encoder_file": str(encoder_path) if spec.frozen else None,
     }
     built = (
-        _class(algo, default=True)
+        _registered(algo)[1]
         .environment(ObservedCorridor, env_config=context, disable_env_checking=True)
         .framework("torch")
         .env_runners(
@@ -70,18 +70,17 @@ def _check(config: Config, spec: PolicySpec) -> None:
         raise ConfigError(f"model.name: {rule}, got {config.model.name!r}")
 
 
-def _class(algo: RLlibConfig, default: bool = False) -> Any:
-    """Return RLlib's class of the algorithm, or its default configuration."""
+def _registered(algo: RLlibConfig) -> Any:
+    """Return RLlib's class of the algorithm, and its default configuration."""
     if algo.algorithm not in ALGORITHMS:
         names = ", ".join(ALGORITHMS)
         raise ConfigError(f"algo.algorithm: must be one of {names}, got {algo.algorithm!r}")
-    found, config = ALGORITHMS[algo.algorithm]()
-    return config if default else found
+    return ALGORITHMS[algo.algorithm]()
 
 
 def trainable(config: Config) -> type:
     """Return RLlib's class of the algorithm, `guarded` for Tune."""
-    return guarded(_class(cast(RLlibConfig, config.algo)))
+    return guarded(_registered(cast(RLlibConfig, config.algo))[0])
 
 
 def networks(module: Any, spec: PolicySpec) -> nn.ModuleDict:

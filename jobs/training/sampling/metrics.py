@@ -34,35 +34,31 @@ class EpisodeMetrics(RLlibCallback):
         self._episodes: deque[dict[str, float]] = deque(maxlen=EPISODES)
         self._begun: deque[dict[str, dict[str, float] | None]] = deque()  # per round; None: running
         self._unfinished: dict[str, float] = {}
-        self.rounds, self._reward_scale = 0, 1.0
+        self.rounds = 0
         self._encoder: tuple[EventVAE, EncoderManifest] | None = None
 
-    def on_sample_end(
-        self, *, metrics_logger: Any, samples: Any, env_runner: Any = None, **kwargs: Any
-    ) -> None:
+    def on_sample_end(self, *, metrics_logger: Any, samples: Any, env_runner: Any, **kwargs: Any) -> None:
         """Log events, means over ended episodes and, every `DRIFT_EVERY` rounds, the encoder's drift."""
         if isinstance(env_runner, PlainEnvRunner) and self.rounds % DRIFT_EVERY == 0:
             for name, value in self._drift(env_runner).items():
                 metrics_logger.log_value(name, value, window=1)
         self.rounds += 1
-        if env_runner is not None:
-            self._reward_scale = env_runner.config.env_config.get(REWARD_SCALE, 1.0)
         events, dropped = (
             np.concatenate([_column(chunk, key) for chunk in samples])
             for key in ("num_events", "dropped_events")
         )
         metrics_logger.log_value("events_per_step", float(events.mean()), window=1)
         metrics_logger.log_value("dropped_events", float(dropped.sum()), window=1)
-        self._count(samples)
+        self._count(samples, env_runner.config.env_config.get(REWARD_SCALE, 1.0))
         for name in self._episodes[0] if self._episodes else ():
             mean = float(np.mean([episode[name] for episode in self._episodes]))
             metrics_logger.log_value(name, mean, window=1)
 
-    def _count(self, samples: Any) -> None:
+    def _count(self, samples: Any, reward_scale: float) -> None:
         """Store ended episodes; add a round's to the averaged ones once they and all earlier ones ended."""
         self._begun.append({chunk.id_: None for chunk in samples if chunk.id_ not in self._unfinished})
         for chunk in samples:
-            earned = float(chunk.get_return()) / self._reward_scale
+            earned = float(chunk.get_return()) / reward_scale
             self._unfinished[chunk.id_] = self._unfinished.get(chunk.id_, 0.0) + earned
             if chunk.is_done:
                 ended = outcome(chunk.get_infos(-1), self._unfinished.pop(chunk.id_))

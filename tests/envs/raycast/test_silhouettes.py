@@ -108,17 +108,18 @@ def test_what_is_in_view_anywhere_on_a_way_was_found_near_it(name, cull_m):
     renderer = RaycastRenderer(dataclasses.replace(scene, moving=moving), WIDTH, 48)
     renderer.move_bodies(moving, 0.0, 1.0)
     bodies, seen, found = renderer.bodies, np.zeros_like(renderer.bodies), np.zeros_like(renderer.bodies)
+    bodies["albedo"] = np.arange(len(bodies))  # a number for each
     focal, frame, few = renderer.frame[0].focal, renderer.room.frames, 0
     frame[0] = renderer.frame[0]
     for _ in range(5):
         way = Way(*rng.uniform((-5.0, 0.0, -5.0, 0.0), (5.0, 30.0, 5.0, 30.0)), 2.0, 10_000, 300_000)
-        near = found["number"][: find_near(bodies, way, focal, WIDTH, cull_m, found)].copy()
+        near = found["albedo"][: find_near(bodies, way, focal, WIDTH, cull_m, found)].copy()
         assert (np.diff(near) > 0).all()
         few += near.size < 0.8 * len(bodies)
         for t_us in np.linspace(way.start_us, way.start_us + way.moving_us, 9):
             aim_along(frame[0], way, t_us)
             count = see_bodies(bodies, frame[0], -32.0 / focal, 32.0 / focal, cull_m, seen)
-            assert np.isin(seen["number"][:count], near).all()
+            assert np.isin(seen["albedo"][:count], near).all()
     assert few or name == "gates"
 
 

@@ -135,6 +135,8 @@ def test_both_codes_of_polarity_are_understood_in_every_type(p, tmp_path):
         ({"t": [1 + 2j, 2]}, "t has dtype complex128"),
         ({"p": ["a", "b"]}, "p has dtype <U1"),
         ({"width": 1, "height": 5, "x": [1, 1]}, "x=1, y=1, 2 of 2 outside the sensor of 1x5"),
+        ({"p": np.zeros(2, "V0")}, "p has dtype .*V0"),
+        ({"is_noise": np.zeros((2, 0), bool)}, r"is_noise has dtype bool and shape \(2, 0\); save numbers"),
         ({"width": "wide"}, "is no readable array file"),
     ],
 )

@@ -13,16 +13,15 @@ def test_a_body_moves_at_its_velocity_in_its_interval_and_rests_outside():
     moving = at_velocity(BALL, (1.0, -2.0, 0.5), begin_s=1.0, end_s=3.0)
     for t_s, moved_s in ((0.0, 0.0), (1.0, 0.0), (1.75, 0.75), (3.0, 2.0), (9.0, 2.0)):
         expected = np.array([1.0, 2.0, 3.0]) + moved_s * np.array([1.0, -2.0, 0.5])
-        assert np.allclose(moving.place(t_s), expected, atol=1e-12)
+        assert np.allclose(moving.places(np.array([t_s])), expected, atol=1e-12)
 
 
 def test_a_path_goes_through_its_places_and_repeats():
     t_s, places_m = np.array([1.0, 2.0, 4.0]), np.array([[0, 0, 1], [2, 0, 1], [2, 4, 3.0]])
     once, again = MovingBody(BALL, t_s, places_m), MovingBody(BALL, t_s, places_m, repeats=True)
-    assert np.array_equal(once.place(3.0), [2.0, 2.0, 2.0])
-    assert np.array_equal(once.place(5.0), [2.0, 4.0, 3.0])
-    assert np.array_equal(again.place(5.0), [2.0, 0.0, 1.0])  # 2 s of a period of 3 s
-    assert np.array_equal(again.place(0.5), [0.0, 0.0, 1.0])
+    assert np.array_equal(once.places(np.array([3.0, 5.0])), [[2.0, 2.0, 2.0], [2.0, 4.0, 3.0]])
+    late = np.array([0.5, 5.0])  # the second is 2 s of a period of 3 s
+    assert np.array_equal(again.places(late), [[0.0, 0.0, 1.0], [2.0, 0.0, 1.0]])
     (body,) = bodies_at([again], 5.0)
     assert (body["x"], body["y"], body["z"], body["rx"]) == (2.0, 0.0, 1.0, 0.1)
 
@@ -37,7 +36,7 @@ def test_many_bodies_together_are_where_each_is_alone():
     ends = [one.t_s[-1] for one in moving]
     for t_s in (0.0, *ends, *rng.uniform(0.0, 60.0, 50)):
         places = np.stack([bodies_at(moving, t_s)[axis] for axis in "xyz"], axis=1)
-        assert places.tobytes() == np.stack([one.place(t_s) for one in moving]).tobytes()
+        assert places.tobytes() == np.concatenate([one.places(np.array([t_s])) for one in moving]).tobytes()
 
 
 @pytest.mark.parametrize(

@@ -87,7 +87,7 @@ def flown(scene, seed, random_share, plan=None, sight_m=math.inf, control_hz=50.
         action = rng.integers(3) if rng.random() < random_share else plan.of_actions(*place, sight_m).argmin()
         moves[action] += 1
         planned = planned_position(spawn_x, tuple(moves), (config.speed_mps, control_hz))
-        told = advance(lane, scene.sections(HEIGHT_M), place, planned)
+        told = advance(lane, (scene.sections(HEIGHT_M), np.zeros((0, 9))), (0.0, 1.0), place, planned)
         if told.success or told.collision:
             return told.success
         place = told.end

@@ -57,7 +57,7 @@ def test_a_control_step_is_its_renders_one_by_one(monkeypatch, together, share):
     config, scene, sensor = look(camera=BY_FRAMES)
     outcome = Outcome((1.0 + 0.05 * share, 5.0 + 0.08 * share), share, 0.0, False, share < 1.0)
     count, events, picture = one_by_one(config, scene, sensor, (1.0, 5.0), outcome, 5000)
-    sensor.step((1.0, 5.0), outcome, 5000)
+    sensor.step((1.0, 5.0), outcome.end, outcome.share, 5000, None)
     assert sensor.renders == count > 1
     assert sensor.events.tobytes() == events.tobytes()
     assert events.size > 40

@@ -10,6 +10,7 @@ from envs.sensor import Sensor
 from jobs.analysis.tables import summarise
 from jobs.analysis.video import frame
 from jobs.config.config import HELD_OUT_SCENE, ConfigError
+from jobs.evaluation import evaluate as evaluation
 from jobs.evaluation.evaluate import (
     announce,
     evaluate,
@@ -157,7 +158,7 @@ def test_a_runs_own_policy_comes_before_a_newer_one(tmp_path, capsys):
         save_training(place, "a", 0, HELD_OUT, "bytestream")
         save_training(other, "a", 0, HELD_OUT, "bytestream")
         found = find_policy(config, run)
-        announce(config, run, found)
+        announce(run, found)
         assert words in capsys.readouterr().out
         assert found.agent == str(place)
 
@@ -217,14 +218,15 @@ def trained(tmp_path, name="bytestream"):
 
 @pytest.mark.system
 @pytest.mark.parametrize("name", ["bytestream", pytest.param("rgb", marks=pytest.mark.slow)])
-def test_an_evaluation_leaves_episodes_table_trajectories_video_and_metrics(tmp_path, name):
+def test_an_evaluation_leaves_episodes_table_trajectories_video_and_metrics(tmp_path, monkeypatch, name):
+    monkeypatch.setattr(evaluation, "default_executor", lambda *_: run_serially)
     config = with_settings(small_config(tmp_path), episodes=2, renderers=["raycast"], video=True)
     config = dataclasses.replace(config, env=dataclasses.replace(config.env, time_limit_s=0.6))
     run = open_run(config)
     save_training(run.policy, name, 0, config.env, name)
     with open_tracker(config, run) as tracker:
-        figures = evaluate(config, run, tracker, run_serially)
-        assert evaluate(config, run, tracker, run_serially) == figures
+        figures = evaluate(run, tracker)
+        assert evaluate(run, tracker) == figures
     rows = list(csv.DictReader((run.evaluation / "episodes.csv").read_text().splitlines()))
     assert len(rows) == 5 * 2  # agents, corridors
     agents = {"policy stochastic", "policy deterministic", "straight", "random", "oracle"}
@@ -239,7 +241,8 @@ def test_an_evaluation_leaves_episodes_table_trajectories_video_and_metrics(tmp_
     tracked = tracker.client.get_run(tracker.run_id).data.metrics
     assert tracked["eval/distance_m"] == figures["eval/distance_m"]
     with open_tracker(config, run) as tracker:
-        evaluate(with_settings(config, episodes=3, video=False), run, tracker, run_serially)
+        more = with_settings(config, episodes=3, video=False)
+        evaluate(dataclasses.replace(run, config=more), tracker)
     assert len((run.evaluation / "episodes.csv").read_text().splitlines()) == 1 + 5 * 3
 
 
@@ -312,17 +315,18 @@ def test_a_second_renderer_that_cannot_draw_leaves_its_row_out_and_the_first_sto
 
 
 @pytest.mark.system
-def test_an_evaluation_with_a_row_missing_tries_it_again_and_a_whole_one_is_done(tmp_path):
+def test_an_evaluation_with_a_row_missing_tries_it_again_and_a_whole_one_is_done(tmp_path, monkeypatch):
     config = with_both_renderers(small_config(tmp_path))
     config = with_settings(config, episodes=1, pyrender_episodes=1, video=False)
     config = dataclasses.replace(config, env=dataclasses.replace(config.env, time_limit_s=0.05))
     run, executor = open_run(config), FakeExecutor(evaluate_part)
+    monkeypatch.setattr(evaluation, "default_executor", lambda *_: executor)
     save_training(run.policy, "a", 0, config.env, "event_columns")
     drawn = {("poles_eval", "pyrender"): "RuntimeError: no OpenGL"}
     with open_tracker(config, run) as tracker:
         for broken, evaluated, missing in ((drawn, 5, 1), ({}, 6, 0), (drawn, 6, 0)):
             executor.broken = broken
-            evaluate(config, run, tracker, executor)
+            evaluate(run, tracker)
             found = len(executor.evaluated), len(finished(run, "evaluate")["missing"])
             assert found == (evaluated, missing)
     assert len(finished(run, "evaluate")["evaluated_at"]) == 1

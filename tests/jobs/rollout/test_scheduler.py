@@ -6,7 +6,7 @@ import pytest
 from jobs.rollout import scheduler
 from jobs.rollout.episodes import roll_out_together
 from jobs.rollout.executors import evaluate_part, evaluate_together, run_serially
-from jobs.rollout.scheduler import NothingEvaluatedError, default_executor, evaluate_tasks, plan_parts
+from jobs.rollout.scheduler import default_executor, evaluate_tasks, plan_parts
 from jobs.rollout.store import EpisodeStore
 from tests.support.configs import AXES, sweep_config
 from tests.support.fake_executor import FakeExecutor
@@ -113,7 +113,7 @@ def without_faults(agent, flights):
 def test_a_sweep_of_which_every_evaluation_raises_stops_with_the_reason(tmp_path, store, monkeypatch):
     monkeypatch.setattr("jobs.rollout.executors.roll_out_together", lambda *given: {}["no\nsuch"])
     tasks = planned(sweep_config(tmp_path), "straight").tasks
-    with pytest.raises(NothingEvaluatedError, match=r"KeyError: 'no.*such'"):
+    with pytest.raises(RuntimeError, match=r"KeyError: 'no.*such'"):
         evaluate_tasks(tasks, store, run_serially)
 
 

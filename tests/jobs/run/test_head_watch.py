@@ -17,8 +17,9 @@ answers = {answers}
 def ask(seconds):
     assert seconds == {silence} / 2
     return answers.pop(0) if answers else {then}
+head_watch.head_answers, head_watch.ended_process = ask, lambda: {ended!r}
 try:
-    with head_watch.watching_head(ask, lambda: {ended!r}):
+    with head_watch.watching_head():
 {work}
     print("done")
 except head_watch.HeadLostError as error:

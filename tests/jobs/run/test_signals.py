@@ -2,7 +2,7 @@ import signal
 
 import pytest
 
-from jobs.run.head_watch import watching_head
+from jobs.run import head_watch
 from jobs.run.signals import ENDING, Ended, end_on_signals, keeping_handlers, signal_of
 
 
@@ -39,7 +39,9 @@ def test_what_starts_meanwhile_keeps_no_handler():
 
 
 @pytest.mark.parametrize("number", ENDING)
-def test_the_signal_is_known_where_ray_raises_a_plain_interrupt_in_its_place(number):
+def test_the_signal_is_known_where_ray_raises_a_plain_interrupt_in_its_place(number, monkeypatch):
+    monkeypatch.setattr(head_watch, "head_answers", lambda seconds: True)
+    monkeypatch.setattr(head_watch, "ended_process", lambda: "")
     end_on_signals()
     assert signal_of(KeyboardInterrupt()) == signal.SIGINT
 
@@ -49,7 +51,7 @@ def test_the_signal_is_known_where_ray_raises_a_plain_interrupt_in_its_place(num
         except Ended:  # not taken for a lost head: Slurm ends Ray's processes together with the job
             raise KeyboardInterrupt from None
 
-    with pytest.raises(KeyboardInterrupt) as error, watching_head(ask=lambda s: True, ended=lambda: ""):
+    with pytest.raises(KeyboardInterrupt) as error, head_watch.watching_head():
         waiting_in_c()
     assert signal_of(error.value) == number
     end_on_signals()

@@ -4,13 +4,12 @@ import pytest
 from jobs.analysis.colours import BASELINE_STYLES, GROUP_STYLES, TAUGHT
 from jobs.analysis.plots import style_of
 from jobs.analysis.statistics import Difference
-from jobs.rollout.episodes import EPISODE
 from jobs.rollout.policies import PRETRAINED
 from jobs.run.provenance import REPOSITORY
 from jobs.study.axis_figure import axis_figure
 from jobs.study.changes import Change, changes_of
 from jobs.study.computed import Study, compute, published
-from jobs.study.figures import KINDS, change_map, contact_ends, contact_map, still_going, worst_conditions
+from jobs.study.figures import KINDS, change_map, still_going, worst_conditions
 from jobs.study.page import figures
 from jobs.study.results import Results, read_cells
 from jobs.study.spec import read_study
@@ -77,17 +76,6 @@ def test_every_experiment_and_every_shipped_policy_has_a_look_of_its_own():
     assert {group.removeprefix(TAUGHT) for group in shipped} <= GROUP_STYLES.keys()
 
 
-def test_the_map_of_contacts_shows_contacts_alone():
-    episodes = np.zeros(4, EPISODE)
-    episodes["collision"] = [True, True, False, True]
-    episodes["distance_m"], episodes["x_m"] = [10.0, 20.0, 100.0, 30.0], [1.0, -2.0, 0.0, 3.0]
-    panel = contact_map({"bytestream": (episodes, episodes[:1])}, 100.0, 25.0).axes[0]
-    usual, changed = (np.asarray(dots.get_offsets()) for dots in panel.collections[:2])
-    np.testing.assert_array_equal(usual, [[10.0, 1.0], [20.0, -2.0], [30.0, 3.0]])
-    assert len(changed) == 1
-    assert panel.get_title("left") == "bytestream: contacts unchanged 3 of 4, changed 1 of 1"
-
-
 def test_episodes_continue_until_they_end():
     episodes = flights(5, trials=20)
     x, share = still_going(episodes, 100.0)
@@ -104,17 +92,6 @@ def test_a_group_has_a_worst_condition_if_it_was_evaluated_unchanged(swept):
     del swept[NOMINAL, "event_image"]
     results = Results(ABOUT, swept)
     assert set(worst_conditions(results, changes_of(results))) == {"bytestream"}
-
-
-def test_contacts_are_those_of_the_same_scene_and_of_no_simulation_twice(swept):
-    found = contact_ends(Results(ABOUT, swept))
-    assert [len(part) for part in found["bytestream"]] == [3 * 20, 2 * 3 * 20]
-    assert [len(part) for part in found["oracle"]] == [20, 0]  # sees no events: dead pixels change nothing
-    swept[FEW, "bytestream"] = swept[NOMINAL, "bytestream"]
-    dense = {"0.2": {"faults.sparsity": 0.2}, "0.5": {"env.scene": "poles_dense"}}
-    axes = {"sparsity": dense, "nominal": {"poles_eval": {}}}  # the unchanged condition stands last
-    found = contact_ends(Results({**ABOUT, "axes": axes}, swept))
-    assert [len(part) for part in found["bytestream"]] == [60, 0]
 
 
 def test_the_map_of_changes_says_each_success_once_below_the_baseline(swept):
@@ -145,4 +122,4 @@ def test_figures_that_need_more_than_was_evaluated_are_left_out(swept):
     alone = {(NOMINAL, "bytestream"): {0: swept[NOMINAL, "bytestream"][0]}}
     said = read_study("robustness")
     study = compute("alone", said, Results(about, alone), [], None)
-    assert set(figures(study)) == {"results_survival", "results_contacts"} & set(said["figures"])
+    assert set(figures(study)) == {"results_survival"}

@@ -33,7 +33,7 @@ def folder(tmp_path):
 
 def test_a_row_says_what_manifest_and_episodes_say_of_each_simulation_once(folder):
     (own,) = success_rates(folder / "robustness_episodes.csv.gz").values()
-    assert own == (1.0, 0.75, 0.5, ("control_hz", "45"), 2)
+    assert own == (1.0, 0.75, 0.5, ("control_hz", 45.0), 2)
     (row,) = model_rows("robustness", folder, folder)
     cells = dict(zip(HEAD, row, strict=True))
     assert cells["seeds"] == "0, 2"

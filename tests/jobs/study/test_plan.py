@@ -6,6 +6,7 @@ import pytest
 from envs.config import CameraConfig, EnvConfig, FidelityConfig, sensor_settings
 from jobs.config.conditions import NOMINAL
 from jobs.config.config import ConfigError
+from jobs.rollout import policies
 from jobs.rollout.policies import find_study_policies, read_policy, with_sensor
 from jobs.run.folder import open_run
 from jobs.study.plan import plan_study
@@ -146,17 +147,21 @@ NAMED = [
 
 
 @pytest.mark.parametrize(("names", "groups"), NAMED)
-def test_pretrained_policies_stand_by_their_groups_and_training_seeds_each_once(tmp_path, names, groups):
+def test_pretrained_policies_stand_by_their_groups_and_training_seeds_each_once(
+    tmp_path, monkeypatch, names, groups
+):
     config = sweep_config(tmp_path, policies=names)
     for place, group, seed in (("a-s1", "a", 1), ("a-set-s0", "a-set", 0), ("a-s0", "a", 0)):
         save_training(tmp_path / "pretrained" / place, group, seed, config.env)
-    policies = find_study_policies(config, open_run(config), tmp_path / "pretrained")
+    monkeypatch.setattr(policies, "PRETRAINED", tmp_path / "pretrained")
+    found = find_study_policies(config, open_run(config))
     named = [(group, seed) for group, seeds in groups.items() for seed in seeds]
-    assert [(policy.group, policy.training) for policy in policies] == named
-    assert plan_study(config, policies).groups == groups
+    assert [(policy.group, policy.training) for policy in found] == named
+    assert plan_study(config, found).groups == groups
 
 
-def test_policies_that_are_not_there_are_refused_with_the_remedy(tmp_path):
+def test_policies_that_are_not_there_are_refused_with_the_remedy(tmp_path, monkeypatch):
+    monkeypatch.setattr(policies, "PRETRAINED", tmp_path / "none")
     folder = open_run(sweep_config(tmp_path))
     kinds = ("event_columns", "event_image")
     one, two = (save_training(tmp_path / name, "a", 0, EnvConfig(), name) for name in kinds)
@@ -170,4 +175,4 @@ def test_policies_that_are_not_there_are_refused_with_the_remedy(tmp_path):
         (damaged,): r"lacks \['name', 'seed', 'sensor'\]; train it again",
     }.items():
         with pytest.raises(ConfigError, match=rule):
-            find_study_policies(sweep_config(tmp_path, policies=names), folder, tmp_path / "none")
+            find_study_policies(sweep_config(tmp_path, policies=names), folder)

@@ -13,7 +13,7 @@ from jobs.run.provenance import REPOSITORY
 from jobs.study.changes import changes_of
 from jobs.study.computed import judge_all
 from jobs.study.contrasts import by_condition
-from jobs.study.figures import contact_ends, pair_differences, worst_conditions
+from jobs.study.figures import pair_differences, worst_conditions
 from jobs.study.page import fill, part
 from jobs.study.report import study_of
 from jobs.study.results import read_published, text_of, values_of
@@ -135,13 +135,10 @@ def test_encoders_and_seeds():
     assert same(new, WAS["encoders"])
 
 
-def test_worst_conditions_and_contacts():
+def test_worst_conditions():
     found = results("robustness")
     worst = worst_conditions(found, changes_of(found))
     assert {group: condition_text(at) for group, at in worst.items()} == WAS["survival"]
-    ends = {group: [[len(one), int(one["collision"].sum())] for one in both]
-            for group, both in contact_ends(found).items()}  # fmt: skip
-    assert ends == WAS["contacts"]
 
 
 @pytest.mark.parametrize("name", ["camera_rates", "dose_response", "dose_response_taught", "robustness"])

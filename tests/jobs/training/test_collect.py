@@ -16,7 +16,7 @@ from jobs.config.registry import JOBS
 from jobs.rollout.agents import PolicyAgent
 from jobs.run.folder import finish, locate_run, open_run
 from jobs.training import collect
-from jobs.training.collect import EventBlock, check_policy, record
+from jobs.training.collect import EventBlock, check_collect, record
 from jobs.training.real_recordings import GAP_US
 from tests.support.configs import compose, small_config
 from tests.support.policies import kinds, save_untrained
@@ -209,5 +209,5 @@ def test_a_resumed_run_flies_its_stored_policy_in_both_recordings_and_asks_for_i
         assert (about["policy"], about["policy_share"]) == (str(policy), 0.5)
         assert about["seed"] == config.seed  # the stored one
     (policy / "policy.json").unlink()
-    assert check_policy(locate_run(config)) is None
+    assert check_collect(locate_run(config)) == (None, [])
     assert finish(folder, "collect", {}) == collect.run(config)

@@ -7,6 +7,7 @@ from envs.config import CameraConfig, EnvConfig
 from envs.events import EVENT
 from envs.recordings import read_recording, write_events
 from jobs.config.config import ConfigError
+from jobs.config.schema import RecordingConfig
 from jobs.run.folder import open_run
 from jobs.training import collect
 from jobs.training.pretrain import _window_by_count, _window_by_time
@@ -14,6 +15,7 @@ from jobs.training.real_recordings import GAP_US, cropped, no_episodes, read_rec
 from tests.support.configs import small_config
 
 ENV = EnvConfig(observation="events")
+SELF_CONTAINED = RecordingConfig()  # for a file that states everything itself
 
 
 def bright_bar(seconds=1.0, width=128, height=100, start_us=10**9):
@@ -48,7 +50,7 @@ def test_of_a_picture_the_middle_with_the_cameras_proportions_stays():
 @pytest.mark.parametrize("control_hz", [200.0, 45.0])
 def test_no_time_is_lost_and_none_is_in_both_parts(bar, control_hz):
     env = dataclasses.replace(ENV, control_hz=control_hz)
-    parts = read_recorded(bar, env, 0.25)
+    parts = read_recorded(bar, env, 0.25, SELF_CONTAINED)
     train, validation = parts["train"], parts["validation"]
     steps = int(0.999 * control_hz)
     assert len(train.ends_us) == round(0.75 * steps)
@@ -57,12 +59,12 @@ def test_no_time_is_lost_and_none_is_in_both_parts(bar, control_hz):
         assert (part.events["t"] > 0).all()
         assert part.events["t"].max() <= part.ends_us[-1]
         assert part.events["x"].max() == part.events["y"].max() == 63
-    whole = read_recorded(bar, env, 1.5 / steps)["train"].events.size
+    whole = read_recorded(bar, env, 1.5 / steps, SELF_CONTAINED)["train"].events.size
     assert train.events.size + validation.events.size == pytest.approx(whole, abs=2 * 64 * 64)
 
 
 def test_parts_follow_a_recording_as_flights_of_its_own(bar):
-    part = read_recorded(bar, ENV, 0.5)["train"]
+    part = read_recorded(bar, ENV, 0.5, SELF_CONTAINED)["train"]
     (flown,) = collect.record([(ENV, 60)], 0, lambda count: None)
     joined = with_recorded(flown, [(part, 20), (part, 10**6)])
     start, end, flight = (joined.index[name] for name in ("step_t_us", "step_end_us", "step_flight"))
@@ -79,7 +81,7 @@ def test_parts_follow_a_recording_as_flights_of_its_own(bar):
 
 
 def test_windows_are_drawn_from_recordings_alone(bar):
-    part = read_recorded(bar, ENV, 0.5)["train"]
+    part = read_recorded(bar, ENV, 0.5, SELF_CONTAINED)["train"]
     recording, rng = with_recorded(no_episodes(ENV), [(part, 100)]), np.random.default_rng(0)
     for draw in (_window_by_count, _window_by_time):
         for _ in range(20):

@@ -8,10 +8,9 @@ from ray.rllib.core.columns import Columns
 from ray.rllib.env.utils.infinite_lookback_buffer import InfiniteLookbackBuffer
 
 from jobs.training.algorithms import build_algorithm
-from jobs.training.imitation.labelled_steps import windows
 from jobs.training.imitation.learner import sequence_steps
 from jobs.training.ppo.learner import REWARD_SCALE, PlainPPOLearner, _minibatch
-from jobs.training.ppo.losses import FIRST_ROW, STARTS, TAKEN, sequences
+from jobs.training.ppo.losses import FIRST_ROW, STARTS, TAKEN, sequences, windows
 from jobs.training.sampling.env_runner import STATES, PlainEnvRunner
 from models.policy.rllib_module import SEQUENCE, STATE
 from tests.support.configs import SHORT, make_config

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from jobs.run.folder import open_run
 from jobs.training import train as training
 from jobs.training.ppo.train import PPO
 from jobs.training.sampling.metrics import EpisodeMetrics
-from jobs.training.train import TrainingError, read_metrics, reported_so_far
+from jobs.training.train import TrainingError, read_metrics, read_results
 from models.policy import load_policy
 from tests.support.configs import TINY, make_config
 from tests.support.patience import HANG_S
@@ -118,6 +119,11 @@ train(folder, Path(sys.argv[2]), lambda step, metrics: None)
 """
 
 
+def reported(results, steps):
+    """Whether a training has told of so many environment steps."""
+    return any(env_steps >= steps for env_steps, _ in read_results(results))
+
+
 @pytest.mark.system
 def test_a_training_listens_on_loopback_alone_and_after_a_kill_goes_on_to_a_policy(tmp_path, encoder):
     command = [sys.executable, "-c", SCRIPT, str(tmp_path), str(encoder)]
@@ -125,14 +131,14 @@ def test_a_training_listens_on_loopback_alone_and_after_a_kill_goes_on_to_a_poli
     folder = open_run(config)
     results = folder.train / "results.jsonl"
     killed = subprocess.Popen(command, cwd=ROOT, env=os.environ | {"HOME": "/nowhere"})
-    while reported_so_far(results)[0] < 256 and killed.poll() is None:
+    while not reported(results, 256) and killed.poll() is None:
         time.sleep(0.05)
     found = listening(killed.pid)
     killed.send_signal(signal.SIGKILL)
     killed.wait()
     check_ray(found)
-    before = reported_so_far(results)[0]
-    assert 256 <= before < 1600
+    assert reported(results, 256)
+    assert not reported(results, 1600)
     subprocess.run(command, cwd=ROOT, check=True, timeout=HANG_S)
     rows = [json.loads(line) for line in results.read_text().splitlines()]
     steps, episodes = ([row[name] for row in rows] for name in ("env_steps", "train/episodes"))
@@ -173,9 +179,10 @@ class Logger(dict):
 def fly_round():
     """Hands one round of sampling to the metrics; what they say then."""
     metrics, logger = EpisodeMetrics(), Logger()
+    runner = SimpleNamespace(config=SimpleNamespace(env_config={}))
 
     def fly(*samples):
-        metrics.on_sample_end(metrics_logger=logger, samples=list(samples))
+        metrics.on_sample_end(metrics_logger=logger, samples=list(samples), env_runner=runner)
         return logger.get("episode_return"), logger.get("success_rate")
 
     return fly

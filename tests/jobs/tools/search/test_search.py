@@ -59,17 +59,17 @@ def test_the_words_of_settings_can_be_given_to_the_launcher():
 def test_a_finished_search_takes_more_trials(tmp_path):
     config = dataclasses.replace(tune_config(*SMALL), runs_dir=str(tmp_path / "runs"))
     folder, fewer = open_run(config), dataclasses.replace(config.own, trials=2)
-    assert search.earlier_trials(folder, config.own) == search.NOTHING_YET
+    assert search.earlier_trials(folder, config.own) == search.Earlier()
     tried = [{"algo.lr": 1e-3, "model.hidden": [8]}, {"algo.lr": 2e-3, "model.hidden": [16, 16]}]
     rows = [row("a", 64, 1.0, **tried[0]), row("b", 64, 2.0, **tried[1])]
     file = folder.path / search.place_name(fewer) / "results.jsonl"
     file.parent.mkdir()
     file.write_text(json_lines(rows))
-    assert search.earlier_trials(folder, config.own) == search.NOTHING_YET  # not finished
+    assert search.earlier_trials(folder, config.own) == search.Earlier()  # not finished
     finish(folder, file.parent.name, {})
     begun = search.earlier_trials(folder, config.own)
     assert (begun.trials, list(begun.rows)) == (2, rows)
-    assert search.earlier_trials(folder, fewer) == search.NOTHING_YET
+    assert search.earlier_trials(folder, fewer) == search.Earlier()
     optuna = search._optuna(config, begun)
     optuna.set_search_properties("distance_m", "max", search_space(config.own.space))
     assert [trial.value for trial in optuna._ot_study.trials] == [1.0, 2.0]
