@@ -170,14 +170,15 @@ class Page:
 def run_note(page: Page) -> str:
     """Return the text at the top of a run's page: a summary, pictures and tables."""
     parts = [headline(page), links(page), *pictures(page), made(page)]
-    used = sum(len(part) + 2 for part in parts)
+    addresses = {path: run_address(page.experiment_id, page.run_id, path) for path in page.tables}
+    tables = {path: f"Table: [{path}]({address})" for path, address in addresses.items()}
+    used = sum(len(part) + 2 for part in [*parts, *tables.values()])
     for path, text in page.tables.items():
-        address = run_address(page.experiment_id, page.run_id, path)
-        whole = f"[{path}]({address})\n\n{text}"
-        part = whole if used + len(whole) < MAX_CHARACTERS else f"Table: [{path}]({address})"
-        used += len(part) + 2
-        parts.append(part)
-    return "\n\n".join(part for part in parts if part)
+        whole = f"[{path}]({addresses[path]})\n\n{text}"
+        longer = len(whole) - len(tables[path])
+        if used + longer < MAX_CHARACTERS:
+            tables[path], used = whole, used + longer
+    return "\n\n".join(part for part in [*parts, *tables.values()] if part)
 
 
 def headline(page: Page) -> str:

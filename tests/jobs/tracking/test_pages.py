@@ -53,6 +53,15 @@ def test_a_table_that_would_be_cut_is_linked_instead():
     assert note.endswith("| b |")
 
 
+def test_a_page_with_room_for_one_table_links_the_others_within_the_limit():
+    lengths = range(4_000, MAX_CHARACTERS, 7)
+    tables = [{"one.md": "x" * length, "two.md": "y" * 500, "three.md": "z" * 500} for length in lengths]
+    notes = [run_note(dataclasses.replace(PAGE, tables=own)) for own in tables]
+    assert max(map(len, notes)) < MAX_CHARACTERS
+    assert {note.count("xxx") > 0 for note in notes} == {False, True}
+    assert all("three.md" in note for note in notes)
+
+
 def test_the_experiments_first_line_leads_to_the_newest_sweep():
     views = {"results": "Results", "charts-1": "Sweep 1: charts", "charts-2": "Sweep 2: charts"}
     views |= {"table-2": "T"}
