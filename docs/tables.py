@@ -58,7 +58,8 @@ CONDITIONS = {
     "new textures": ("world", "texture_change"),
 }
 POLICIES = {
-    ("robustness", "bytestream_hold"): "`bytestream_hold`: imitation, domain randomization",
+    ("robustness", "bytestream_late"): "`bytestream_late`: imitation, domain randomization, delays",
+    ("robustness", "bytestream_hold"): "`bytestream_hold`: the same without delays",
     ("taught_claims", "bytestream"): "`bytestream`: imitation",
     ("taught_claims", "event_image"): "`event_image`: imitation",
     ("ppo_claims", "bytestream"): "`bytestream`: PPO",

@@ -29,7 +29,7 @@ GROUP_STYLES = {
     "event_set": ("#000000", "D"), "event_image": ("#d55e00", "v"), "event_image_vae": ("#e69f00", "P"),
     "rgb": ("#cc79a7", "X"), "bytestream_1500k": ("#7a5195", "<"), "bytestream_paper": ("#5b6b1f", "h"),
     "bytestream_robust": ("#b0003a", ">"), "bytestream_hold": ("#3a3ac8", "p"),
-    "body_hold": ("#2f7f7f", "H"),
+    "bytestream_late": ("#8f6bd6", "8"), "body_hold": ("#2f7f7f", "H"),
 }  # fmt: skip
 BASELINE_STYLES = {
     "oracle": ("#6b7280", "."),

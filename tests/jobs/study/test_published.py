@@ -16,7 +16,7 @@ from jobs.study.contrasts import by_condition
 from jobs.study.figures import pair_differences, worst_conditions
 from jobs.study.page import fill, part
 from jobs.study.report import study_of
-from jobs.study.results import read_published, text_of, values_of
+from jobs.study.results import Results, read_published, text_of, values_of
 from jobs.study.spec import GAIN, read_study
 from jobs.study.spread import crossed_tables, factors
 from jobs.study.summaries import summaries_of
@@ -50,9 +50,16 @@ TESTS = [
 ]  # fmt: skip
 
 
+LATER = {"robustness": {"bytestream_late"}}  # study -> groups that it got after the numbers were frozen
+
+
 @cache
 def results(name):
-    return read_published(DATA, name)
+    """A published study with the groups that it had when its numbers were frozen."""
+    found, later = read_published(DATA, name), LATER.get(name, set())
+    groups = {group: seeds for group, seeds in found.groups.items() if group not in later}
+    cells = {(at, group): own for (at, group), own in found.cells.items() if group not in later}
+    return Results({**found.facts, "groups": groups}, cells)
 
 
 @cache

@@ -133,6 +133,15 @@ def test_a_study_that_was_trained_in_two_runs_is_the_study_trained_in_one():
     assert [one["run"] for one in both.facts["earlier"]] == [whole.facts["run"]]
 
 
+def test_a_study_from_before_a_fact_was_recorded_is_joined_unless_the_fact_differs():
+    whole = read_published(DATA, "encoder_targets")
+    older = {name: fact for name, fact in whole.facts.items() if name not in ("split", "env_steps")}
+    earlier, more = only(Results(older, whole.cells), {0, 1, 2}), only(whole, {3, 4})
+    assert joined(earlier, more).groups == whole.groups
+    with pytest.raises(ConfigError, match="other split"):
+        joined(earlier, Results({**more.facts, "split": "validation"}, more.cells))
+
+
 @pytest.mark.parametrize(
     ("seeds", "changed", "named"),
     [

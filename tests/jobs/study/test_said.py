@@ -38,7 +38,7 @@ def test_what_is_left_to_the_policy_that_holds_and_what_late_actions_change():
     found = [success(late, 50.0), success(dense, 200.0), success(dense, 45.0)]
     assert said(pattern) == [round(rate) for rate in found]
     groups = [group for group in sweep.trained if len(sweep.groups[group]) > 1 and group != "rgb"]
-    assert len(groups) == 8
+    assert len(groups) == 9
     gain = {ms: [round(success(late, ms, group) - success(late, 0.0, group)) for group in groups]
             for ms in (25.0, 50.0, 100.0)}  # fmt: skip
     assert said(r"25 and 50 ms change success by (-\d+) to \+(\d+) points") == ends(gain[25.0] + gain[50.0])
