@@ -120,7 +120,8 @@ def sub_renders(step_m: float, max_step_m: float) -> int:
     """Return the number of equal parts, one render each, into which to cut a way, none above `max_step_m`.
 
     It is at least 1, also for a step of 0 m. A step that exceeds a multiple of `max_step_m` by
-    rounding alone (relative 1e-9) is not divided further.
+    rounding alone (relative 1e-9) is not divided further. `step_m` must be finite and not negative,
+    `max_step_m` positive; compiled code does not check it.
     """
     return max(1, math.ceil(step_m / max_step_m * (1.0 - 1e-9)))
 

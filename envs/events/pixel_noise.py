@@ -226,7 +226,7 @@ def draw_noise(
     t_us: int,
     rng: np.random.Generator,
 ) -> PixelState:
-    """Draw the noise of a camera that has just seen its first frame; levels start at random places.
+    """Draw the noise of a camera that has just seen its first frame, and move its levels to random places.
 
     Args:
         camera: Settings of the camera.

@@ -35,7 +35,11 @@ ALWAYS: dict[str, tuple[str, dict[str, object]]] = {
     "video_events": (
         "video",
         {
-            **{"path": "video.mp4", "output": None, "fps": None, "transfer": None, "interpolate": "linear"},
+            "path": "video.mp4",
+            "output": None,
+            "fps": None,
+            "transfer": None,
+            "interpolate": "linear",
             "luminance_floor": None,
         },
     ),

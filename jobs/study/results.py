@@ -207,9 +207,10 @@ def joined(earlier: Results, more: Results) -> Results:
         ConfigError: The runs were evaluated differently, or have a training in common.
     """
     one, other = earlier.facts, more.facts
-    # Older versions recorded no split, which was always this, and no env_steps, which they cannot tell.
-    told = [{"split": "eval", "env_steps": other.get("env_steps"), **facts} for facts in (one, other)]
-    differ = [name for name in EVALUATION if told[0].get(name) != told[1].get(name)]
+    # Older versions recorded neither the split, which was always "eval", nor env_steps.
+    usual = {"split": "eval", "env_steps": other.get("env_steps")}
+    differ = [name for name in EVALUATION
+              if one.get(name, usual.get(name)) != other.get(name, usual.get(name))]  # fmt: skip
     variants, more_variants = one.get("variants", {}), other.get("variants", {})
     differ += [name for name in variants if more_variants.get(name, variants[name]) != variants[name]]
     both = [f"{group} s{seed}" for group, seeds in one["groups"].items() for seed in seeds

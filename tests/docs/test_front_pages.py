@@ -166,6 +166,30 @@ def test_the_robust_policy_does_as_the_pages_say():
     assert said(r"With actions 100 ms late it reaches (\d+) %", "docs/index.md") == [round(late)]
 
 
+def test_the_policy_for_late_actions_does_as_the_pages_say():
+    means = {
+        at[:2]: mean(own.values()) for at, own in success("robustness").items() if at[2] == "bytestream_late"
+    }
+    late = round(means.pop(("action_delay", "100")))
+    others = [round(value) for value in means.values()]
+    ends = [min(others), max(others)]
+    assert said(r"`bytestream_late` (\d+) %", "docs/index.md") == [late]
+    assert said(r"(\d+) to (\d+) % under \d+ of \d+ conditions, and (\d+) % with", "docs/results.md") == [
+        *ends,
+        late,
+    ]
+    here = {at: round(mean(own.values())) for at, own in success("late_actions").items()}
+    delays = [
+        here["action_delay", ms, group]
+        for group in ("bytestream_late", "bytestream_hold")
+        for ms in ("50", "100")
+    ]
+    dense = [here["control_hz_dense", "25", group] for group in ("bytestream_late", "bytestream_hold")]
+    told = r"(\d+) % at 50 ms and (\d+) % at 100 ms \(`bytestream_hold`: (\d+) and (\d+)\)"
+    assert said(told, "docs/train.md") == delays
+    assert said(r"(\d+) % in `poles_dense` at 25 Hz \((\d+)\)", "docs/train.md") == dense
+
+
 def test_the_readme_counts_the_formats_that_can_be_written(tmp_path):
     with pytest.raises(ValueError, match="format") as error:
         write_events(tmp_path / "a.unknown", np.empty(0, EVENT), 1, 1, "unknown")
