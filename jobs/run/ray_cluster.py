@@ -31,6 +31,7 @@ QUIET = {
     # On a busy machine a worker takes minutes to start; after one minute, Ray would start a second one.
     "RAY_worker_register_timeout_seconds": "600",
     "RAY_AIR_NEW_OUTPUT": "0",
+    "RAY_CHDIR_TO_TRIAL_DIR": "0",  # relative paths, as of a world, name the same files in a worker
     # Record at once which checkpoint is the newest: after a kill, the record must not name one
     # that newer ones have replaced.
     "TUNE_GLOBAL_CHECKPOINT_S": "0",

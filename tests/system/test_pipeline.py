@@ -236,3 +236,11 @@ def test_a_sweep_evaluates_the_policy_just_trained_on_loopback_alone_and_a_rerun
     children = client.search_runs([experiment], f"tags.`mlflow.parentRunId` = '{parent.info.run_id}'")
     assert len({child.info.run_name for child in children}) == len(children) >= 7
     assert {child.info.status for child in children} == {"FINISHED"}
+
+
+def test_the_path_of_a_world_counts_from_the_folder_of_the_command_in_every_process(tmp_path):
+    (tmp_path / "world.csv").write_text("sphere,5,0,2,1,0,0,0,1,1,1\n")
+    words = "+exp=dodge budget=smoke study.scene=world.csv study.policies=[straight] study.trials=10"
+    variants = ["~study.variants.body", "~study.variants.kinematic"]
+    command = [sys.executable, "-m", "platform.launch", *words.split(), *variants]
+    assert "Not evaluated" not in said(*command, cwd=tmp_path, PYTHONPATH=str(ROOT))
