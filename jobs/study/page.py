@@ -227,10 +227,10 @@ def _provenance(study: Study, _: str) -> str:
     count = sum(len(own) for trainings in different.values() for own in trainings.values())
     runs = sum(len(seeds) for seeds in results.groups.values())
     commits = ", ".join(commit[:7] for commit in facts["evaluated_at"])
-    made = [f"on {one['date']} by `{one['command']}`" for one in (*facts.get("earlier", ()), facts)]
+    made = dict.fromkeys(f"on {one['date']}" for one in (*facts.get("earlier", ()), facts))
     files = {
         "episodes": "episodes.csv.gz", "runs": "trainings.csv", "estimates": "estimates.csv",
-        "changes": "changes.csv", "tests": "tests.csv", "event errors": "about.json",
+        "changes": "changes.csv", "tests": "tests.csv", "commands and event errors": "about.json",
     }  # fmt: skip
     links = ", ".join(f"[{what}](data/{name}_{file})" for what, file in files.items())
     return (

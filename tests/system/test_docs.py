@@ -53,8 +53,7 @@ def commands() -> list[str]:
     """The words of each command of the launcher that a page shows, once."""
     found: dict[str, None] = {}
     for page in PAGES:
-        # "Made on" gives the command of that day, as the data have it.
-        text = re.sub(r"^Made on .*$", "", page.read_text(), flags=re.MULTILINE).replace("\\\n", " ")
+        text = page.read_text().replace("\\\n", " ")
         found |= dict.fromkeys((match[1] or match[2]).strip() for match in LAUNCHED.finditer(text))
         found |= dict.fromkeys(f"{MADE[target]} {words}" for target, words in ARGS.findall(text))
     # tests/system/test_plugins.py gives those with a plug-in; a reader calibrates the camera `mine`, and has
