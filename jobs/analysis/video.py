@@ -39,25 +39,35 @@ class Film:
     decode: Decode | None
     fps: float = FILM_FPS
     _writer: Generator[None, np.ndarray | None, None] | None = None
-    _recent: list[np.ndarray | None] = field(default_factory=list)
+    _recent: list[tuple[np.ndarray, np.ndarray | None, np.ndarray, str]] = field(default_factory=list)
     _frames: int = 0
 
     def step(
         self, luminance: np.ndarray, events: np.ndarray | None, window: np.ndarray, caption: str
     ) -> None:
         """Add a control step: luminance (H, W), EVENT array (None if none are simulated), and window."""
-        self._recent.append(events)
-        stride = max(1, round(self.control_hz / FRAMES_PER_FLIGHT_S))
-        if len(self._recent) < stride:
+        self._recent.append((np.array(luminance), events, window, caption))
+        if len(self._recent) == self._stride:
+            self.finish()
+
+    @property
+    def _stride(self) -> int:
+        """Return the number of control steps of a picture."""
+        return max(1, round(self.control_hz / FRAMES_PER_FLIGHT_S))
+
+    def finish(self) -> None:
+        """Show the steps since the last picture, so that a film ends with the last step of its episode."""
+        if not self._recent:
             return
-        shown = [batch for batch in self._recent if batch is not None]
+        luminance, _, window, caption = self._recent[-1]
+        shown = [events for _, events, _, _ in self._recent if events is not None]
         self._recent = []
         panels = [("luminance", np.repeat(grey_picture(luminance)[:, :, None], 3, axis=2))]
         if shown:
             panels.append(("events", coloured(last_polarity(np.concatenate(shown), luminance.shape))))
         if self.decode is not None:
             panels.append(("decoded from the latents", coloured(self.decode(window))))
-        slower = self.control_hz / stride / FILM_FPS
+        slower = self.control_hz / self._stride / FILM_FPS
         self.add(frame(panels, f"{caption}   {slower:.0f}x slower" if slower > 1 else caption))
 
     def add(self, picture: np.ndarray) -> None:
@@ -107,6 +117,7 @@ def open_film(path: Path, control_hz: float, decode: Decode | None, fps: float =
     with replaced(path) as part:
         with contextlib.closing(Film(part, control_hz, decode, fps)) as film:
             yield film
+            film.finish()
         film.check()
 
 
