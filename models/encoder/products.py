@@ -30,6 +30,7 @@ LINE = 64  # bytes, one row of a tile
 DEPTH, HEIGHT = 1024, 192  # size of a block, which stays in the L2 cache
 NEAR = 1 << 15  # bytes; a panel is copied if its first and last line are farther apart
 LINES = 4  # lines of a block of columns, read together
+SMALL = 1 << 15  # bytes; a block of at most this size stays in the L1 cache
 CHAINS = 64  # parallel sums of `dot`
 SHARED = 1 << 21  # multiplications from which a second thread pays off
 
@@ -135,8 +136,10 @@ def add_product(a, b, out, anew) -> None:  # type: ignore[no-untyped-def]  # noq
     float32 or float64, and that `out` shares no memory with `a` and `b`.
     """
     rows, columns, depths, lanes = out.shape[0], out.shape[1], a.shape[1], LINE // out.itemsize
-    lines = 1 if b.strides[0] < b.strides[1] else max(1, min(LINES, -(-columns // lanes)))
-    most, wide = min(DEPTH, depths), lines * lanes
+    most = min(DEPTH, depths)
+    together = b.strides[0] >= b.strides[1] or most * LINE * LINES <= SMALL
+    lines = max(1, min(LINES, -(-columns // lanes))) if together else 1
+    wide = lines * lanes
     in_line, near = out.strides[1] == out.itemsize, b.strides[1] == b.itemsize and b.strides[0] * most <= NEAR
     room = np.empty((ROWS + 1 + most) * wide, out.dtype)
     if columns % lanes:
