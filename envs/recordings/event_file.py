@@ -32,6 +32,7 @@ CHUNK_EVENTS = 1 << 18  # events that a writer converts at once
 TRIGGER = np.dtype([("t", "<i8"), ("channel", "<i2"), ("p", "i1")])  # us; +1 rising, -1 falling, 0 pulse
 NO_TRIGGERS = np.empty(0, TRIGGER)
 
+MAX_SIDE = 1 << 16  # of a sensor [pixels]; coordinates have 16 bits
 # Kinds of damage: reasons to leave something out. Keys of `EventFile.damage`.
 OUTSIDE = "events outside the sensor"
 RESERVED = "words of types that the encoding does not have"
@@ -222,17 +223,19 @@ class Request:
     def sized(self, width: int | None, height: int | None) -> "Request":
         """Return the same request with the sensor's size from the file filled in.
 
+        A side outside 1..`MAX_SIDE` is not a size: it counts as not stated.
+
         Raises:
             ValueError: The file and the caller state different sizes.
         """
+        sides = {"width": self.width, "height": self.height}
         for name, said, given in (("width", width, self.width), ("height", height, self.height)):
-            if said is not None and given is not None and said != given:
+            if said is None or not 1 <= said <= MAX_SIDE:
+                continue
+            if given is not None and said != given:
                 raise self.refusal(f"says {name}={said} and the caller says {given}; leave {name} out")
-        return dataclasses.replace(
-            self,
-            width=self.width if width is None else width,
-            height=self.height if height is None else height,
-        )
+            sides[name] = said
+        return dataclasses.replace(self, width=sides["width"], height=sides["height"])
 
 
 @dataclasses.dataclass(frozen=True)

@@ -252,7 +252,7 @@ def _part(
     """Return some rows as events."""
     blocks = {path: file[path][rows] for path in dict.fromkeys(found.paths)}
     columns = zip(found.paths, found.fields, strict=True)
-    t, x, y, p = (column_of(blocks[path], field) for path, field in columns)
+    t, x, y, p = (column_of(request, blocks[path], field) for path, field in columns)
     usual = usual_unit(t)
     if t.dtype.kind == "f" and found.layout and found.layout.time_unit:
         usual = found.layout.time_unit

@@ -41,11 +41,17 @@ def roles(request: Request, names: Iterable[str]) -> tuple[dict[str, int], str |
     return places, told
 
 
-def column_of(rows: np.ndarray, field: str | int | None) -> np.ndarray:
-    """Return a column of rows by its name or number; None: the rows are one column."""
-    if field is None:
-        return rows
-    return rows[field] if isinstance(field, str) else rows[:, field]
+def column_of(request: Request, rows: np.ndarray, field: str | int | None) -> np.ndarray:
+    """Return a column of rows by its name or number; None: the rows are one column.
+
+    Raises:
+        ValueError: The column does not contain real numbers.
+    """
+    column: np.ndarray = rows[:, field] if isinstance(field, int) else rows if field is None else rows[field]
+    if column.dtype.kind not in "iufb":
+        name = "a column" if field is None else f"column {field}"
+        raise request.refusal(f"{name} has dtype {column.dtype}; save numbers")
+    return column
 
 
 def microseconds(request: Request, t: np.ndarray, said: str | None, usual: str | None = None) -> np.ndarray:

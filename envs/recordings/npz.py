@@ -287,7 +287,7 @@ def _parts(
         for first in range(0, count, request.part_events):
             size = min(request.part_events, count - first)
             some = _side_by_side(request, files, used, size)
-            t, x, y, p, *labels = (column_of(some[array], field) for array, field in columns)
+            t, x, y, p, *labels = (column_of(request, some[array], field) for array, field in columns)
             t_us = microseconds(request, t, unit, usual_unit(t))
             yield assemble(request, t_us, x, y, p, *labels)
         for file, array in zip(files, used, strict=True):

@@ -85,7 +85,7 @@ def read_ros(request: Request) -> Opened:
     topic = _chosen(request, topics)
     for _, first in _decoded(bags, topic):
         if first is not None:
-            request = request.sized(first.width or None, first.height or None)
+            request = request.sized(first.width, first.height)
             break
     return Opened("ros", request, _parts(request, bags, topic))
 

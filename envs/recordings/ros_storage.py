@@ -99,7 +99,10 @@ def open_bags(request: Request) -> list[Bag]:
 
 
 def messages(bag: Bag, topics: set[str]) -> Iterator[Message]:
-    """Yield the complete messages of some topics, in the order of their recording."""
+    """Yield the complete messages of some topics, in the order of their recording.
+
+    Where the library cannot read on, an empty message is the last one: its decoder counts it as damaged.
+    """
     if not bag.is_whole:
         for item in _walk(bag.path):
             if isinstance(item, Message) and item.topic in topics:
@@ -107,9 +110,13 @@ def messages(bag: Bag, topics: set[str]) -> Iterator[Message]:
         return
     with _reader(bag.path) as reader:
         chosen = [one for one in reader.connections if one.topic in topics]
-        if chosen:
-            for connection, _, raw in reader.messages(chosen):
+        try:
+            for connection, _, raw in reader.messages(chosen) if chosen else ():
                 yield Message(connection.topic, _kind(connection.msgtype), bytes(raw))
+        except MemoryError:
+            raise
+        except Exception:  # the library's errors have no common base
+            yield Message(chosen[0].topic, _kind(chosen[0].msgtype), b"")
 
 
 def _whole(path: Path) -> Bag | None:
@@ -269,7 +276,11 @@ def _walk_db3(path: Path) -> Iterator[Topic | Message]:
 
 
 def _unpacked(data: bytes, compression: str) -> bytes:
-    """Return the part of a chunk that can be unpacked."""
+    """Return the part of a chunk that can be unpacked.
+
+    Raises:
+        EOFError: The chunk is damaged.
+    """
     if compression in ("", "none"):
         return data
     unpack: Any
@@ -283,5 +294,10 @@ def _unpacked(data: bytes, compression: str) -> bytes:
         from backports import zstd
 
         unpack = zstd.ZstdDecompressor()
-    unpacked: bytes = unpack.decompress(data)
+    try:
+        unpacked: bytes = unpack.decompress(data)
+    except MemoryError:
+        raise
+    except Exception as error:  # the errors of the three libraries have no common base
+        raise EOFError("a chunk is damaged") from error
     return unpacked

@@ -88,6 +88,40 @@ def test_damaged_files_of_every_format_are_read_or_refused_by_name(tmp_path):
         assert counts[path.name]["refused"] > 6, path.name
 
 
+@pytest.mark.parametrize("side", ["0", "70000", "99999999999999999999"])
+def test_a_header_with_an_impossible_side_states_none(side, tmp_path):
+    path = tmp_path / "street.txt"
+    rows = "\n".join(f"{t} {x} {y} {p}" for t, x, y, p in EVENTS[["t", "x", "y", "p"]].tolist())
+    path.write_text(f"{side} 34\n{rows}\n")
+    file = read_events(path, format="txt", columns=("t", "x", "y", "p"))
+    assert (file.width, file.height) == (None, 34)
+    assert len(file.events) == len(EVENTS)
+    assert read_events(path, format="txt", columns=("t", "x", "y", "p"), width=34).width == 34
+
+
+@pytest.mark.parametrize("kind", ["V2", "S2", "c8"])
+def test_a_field_without_real_numbers_is_refused_by_name(kind, tmp_path):
+    path = tmp_path / "rows.npy"
+    rows = np.zeros(30, [("t", "<i8"), ("x", kind), ("y", "<u2"), ("p", "i1")])
+    np.save(path, rows)
+    with pytest.raises(ValueError, match="column x has dtype") as refused:
+        read_events(path)
+    assert str(refused.value).count(str(path)) == 1
+
+
+def test_a_bag_is_read_up_to_a_damaged_message_and_says_so(tmp_path):
+    store, part = davis(EVENTS, "dvs_msgs", True)
+    path = write_bag(tmp_path / "ros", {"/dvs/events": part}, store, True)
+    good = bytearray(path.read_bytes())
+    good[good.rindex(b"time=", 0, good.rindex(b"op=\x04")) + 5] ^= 255  # unlike the time in the index
+    path.write_bytes(good)
+    file = read_events(path)
+    assert file.damage
+    assert 0 < len(file.events) < len(EVENTS)
+    with pytest.raises(ValueError, match="damaged"):
+        read_events(path, strict=True)
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(7200)
 @pytest.mark.parametrize("part", range(16))
