@@ -71,7 +71,8 @@ def microseconds(request: Request, t: np.ndarray, said: str | None, usual: str |
     if unit == "us":
         return t
     if unit == "ns" and t.dtype.kind in "iu":
-        return (t + t.dtype.type(500)) // 1000  # to the nearest
+        wide = t if t.dtype.itemsize == 8 else t.astype(np.int64)  # 500 does not fit into every type
+        return (wide + wide.dtype.type(500)) // 1000  # to the nearest
     if unit == "ms" and t.dtype.kind in "iu":
         return t.astype(np.int64) * 1000
     return t.astype(np.float64) * US_PER[unit]

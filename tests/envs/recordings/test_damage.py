@@ -109,6 +109,15 @@ def test_a_field_without_real_numbers_is_refused_by_name(kind, tmp_path):
     assert str(refused.value).count(str(path)) == 1
 
 
+@pytest.mark.parametrize("kind", ["i1", "u1", "u2", "i4", "u8"])
+def test_nanoseconds_of_any_type_are_rounded_without_overflow(kind, tmp_path):
+    path = tmp_path / "rows.npy"
+    rows = np.zeros(30, [("t", kind), ("x", "<u2"), ("y", "<u2"), ("p", "i1")])
+    rows["t"] = t = np.linspace(0, min(np.iinfo(kind).max, 10**9), 30).astype(np.int64)
+    np.save(path, rows)
+    assert read_events(path, time_unit="ns").events["t"].tolist() == ((t + 500) // 1000).tolist()
+
+
 def test_a_bag_is_read_up_to_a_damaged_message_and_says_so(tmp_path):
     store, part = davis(EVENTS, "dvs_msgs", True)
     path = write_bag(tmp_path / "ros", {"/dvs/events": part}, store, True)
